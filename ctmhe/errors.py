@@ -1,0 +1,43 @@
+"""What can go wrong through the caller's hand: every error says what was given, what was expected, what to try."""
+
+from __future__ import annotations
+
+
+class CtmheError(Exception):
+    """Base of every error that this library raises on purpose."""
+
+
+class InputError(CtmheError, ValueError):
+    """A value does not fit: wrong shape, unknown name, not finite, out of its range."""
+
+
+class ModelError(CtmheError, ValueError):
+    """A model is inconsistent: its functions return wrong shapes, fail, or cannot be differentiated."""
+
+
+class TooLate(CtmheError, ValueError):
+    """A measurement or input lies before the estimation window and can no longer be used."""
+
+
+class NotEstimated(CtmheError, ValueError):
+    """A time was asked for that no estimate covers; `smooth` gives past times inside the last window."""
+
+
+class TriggerError(CtmheError, RuntimeError):
+    """A trigger policy raised or returned something that is not an answer; the policy is named."""
+
+
+class SolverError(CtmheError, RuntimeError):
+    """A numerical tool could not be set up (never raised for a solve that merely fails: see `Status`)."""
+
+
+class FmuError(CtmheError, RuntimeError):
+    """An FMU cannot be read, loaded, evaluated or used in the role that it was given."""
+
+
+class MissingExtra(CtmheError, ImportError):
+    """An optional library is not installed; the message names the extra that brings it."""
+
+    def __init__(self, library: str, extra: str, purpose: str):
+        super().__init__(f"{purpose} needs {library}, which is not installed: pip install 'ctmhe[{extra}]'")
+        self.library, self.extra = library, extra

@@ -1,0 +1,574 @@
+"""Moving horizon estimation on explicit state: thesis 3.2, eq. (3.12)-(3.19), and its discrete-time form (3.6)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ctmhe.data.log import Log
+from ctmhe.data.window import held_inputs
+from ctmhe.errors import InputError, NotEstimated, TooLate
+from ctmhe.estimators.priors import Piece, filtering_prior, trajectory_at
+from ctmhe.estimators.state import State, load_state, save_state
+from ctmhe.models.continuous import Model
+from ctmhe.models.signals import Signals
+from ctmhe.solvers.base import Solution
+from ctmhe.solvers.gauss_newton import GaussNewton
+from ctmhe.solvers.ipopt import Ipopt
+from ctmhe.solvers.ladder import climb
+from ctmhe.transcription.assembly import Assembly, Records
+from ctmhe.transcription.grid import Mesh
+from ctmhe.transcription.integrators import Integrator, StepMap
+from ctmhe.transcription.problem import Guess, Window, rollout
+from ctmhe.transcription.stage import StageFunction
+from ctmhe.types import (
+    Array,
+    Bounds,
+    DiscountedCost,
+    Estimate,
+    Input,
+    Measurement,
+    Outcome,
+    Status,
+    Trajectory,
+    finite_time,
+    frozen,
+)
+
+SOLVERS = ("gauss-newton", "ipopt")
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """The state carried forward from the last estimate, without disturbance.
+
+    Attributes
+    ----------
+    t : float
+    x : array (nx,), p : array (np,), y : array (ny,)
+        State, parameters and predicted output at `t`.
+    """
+
+    t: float
+    x: Array
+    p: Array
+    y: Array
+
+
+class MHE:
+    """Moving horizon estimator: configuration and compiled functions, immutable once built.
+
+    All that changes lives in an explicit state: `state = mhe.init(...)`, then `control`, `observe` and `estimate`, each of which
+    returns a new state and leaves the old one valid.
+
+    Parameters
+    ----------
+    model : Model
+        A `ContinuousModel`, `DiscreteModel` or `FmuModel`.
+    horizon : float
+        Length T of the window in seconds; the window grows to it from t0.
+    interval : float, optional
+        Shooting interval and cell on which w is constant, seconds, anchored at its absolute multiples. The step of a
+        `DiscreteModel` when left out.
+    integrator : RK4 or CVODES, optional
+        Not for a `DiscreteModel`, which has its own step map.
+    cost : DiscountedCost
+        Weights and discount. A prior weight over states only holds the parameters at their given values; one over states
+        and parameters estimates them.
+    bounds : Bounds, optional
+        Imposed on x at every node, w, p, and y and the output residual at slot ends.
+    hold : {"zero", "linear", "point"} or mapping output -> one of these, optional
+        `zero` and `linear` rebuild the whole signal from the samples, weighted by R; `point` counts each sample at its own
+        time, weighted by R_point. Default `zero`.
+    hold_limit : float, optional
+        Seconds for which a held sample counts when its sensor falls silent; the horizon when left out.
+    input_hold : {"zero", "linear"}
+        How the known input runs between its samples.
+    filtering : bool
+        `DiscreteModel` only: count the measurement at the estimate's own time.
+    longest_wait : float, optional
+        The longest wait between estimates, if declared; must be shorter than the horizon (3.19).
+    solver : {"gauss-newton", "ipopt"}
+    max_iterations : int
+    clock : callable, optional
+        Seconds, for `Estimate.seconds`.
+
+    Raises
+    ------
+    InputError
+        For lengths that are not positive, weights and bounds that do not fit, unknown names, and a declared wait that is not
+        shorter than the horizon.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        *,
+        horizon: float,
+        interval: float | None = None,
+        integrator: Integrator | None = None,
+        cost: DiscountedCost,
+        bounds: Bounds | None = None,
+        hold: Any = None,
+        hold_limit: float | None = None,
+        input_hold: str = "zero",
+        filtering: bool = False,
+        longest_wait: float | None = None,
+        solver: str = "gauss-newton",
+        max_iterations: int = 50,
+        clock: Callable[[], float] = time.perf_counter,
+    ):
+        self._configuration = {key: value for key, value in locals().items() if key not in ("self", "__class__")}
+        self.model, self.clock = model, clock
+        self.horizon = _positive("horizon", horizon)
+        if model.step is not None:
+            if integrator is not None:
+                raise InputError("integrator: a DiscreteModel has its own step map; leave the integrator out")
+            if interval is not None and abs(interval - model.step) > 1e-9 * model.step:
+                raise InputError(f"interval: must be the model's step {model.step:g} s or left out, got {interval:g}")
+            integrator, interval = StepMap(), model.step
+        elif integrator is None or interval is None:
+            raise InputError("a ContinuousModel needs interval= (seconds) and integrator=RK4(step=...) or CVODES(...)")
+        self.interval = _positive("interval", interval)
+        if self.interval > self.horizon * (1 + 1e-9):
+            raise InputError(f"interval {self.interval:g} s is longer than the horizon {self.horizon:g} s")
+        self.integrator = integrator
+        self.bounds = bounds or Bounds()
+        if not isinstance(cost, DiscountedCost):
+            raise InputError(f"cost must be a DiscountedCost, got {type(cost).__name__}")
+        self.cost = cost
+        self.longest_wait = longest_wait
+        if longest_wait is not None:
+            self.check_wait(longest_wait)
+        if solver not in SOLVERS:
+            raise InputError(f"solver must be one of {', '.join(SOLVERS)}, got {solver!r}")
+        self.hold_limit = self.horizon if hold_limit is None else _positive("hold_limit", hold_limit)
+        kinds = [hold] if isinstance(hold, str) or hold is None else list(dict(hold).values())
+        signal = model.step is None and (any(kind != "point" for kind in kinds) or len(kinds) < len(model.y))
+        self.stage = StageFunction(model, integrator, signal=signal)
+        self.assembly = Assembly(
+            model,
+            self.stage,
+            cost,
+            self.bounds,
+            interval=self.interval,
+            parts=integrator.parts(self.interval),
+            hold=hold,
+            hold_limit=self.hold_limit,
+            input_hold=input_hold,
+            filtering=filtering,
+        )
+        self._gauss_newton = GaussNewton(self.stage, max_iterations=max_iterations)
+        self._reference = Ipopt(self.stage)
+        self._solver = self._gauss_newton if solver == "gauss-newton" else self._reference
+        self._silent = np.zeros(len(model.w))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuild, (self._configuration,)
+
+    def __repr__(self) -> str:
+        kind = f"{type(self.integrator).__name__}, interval {self.interval:g} s"
+        return f"MHE of {self.model.name!r}: horizon {self.horizon:g} s, {kind}, eta {self.cost.eta:g}"
+
+    def check_wait(self, wait: float) -> None:
+        """Raise `InputError` unless a declared longest wait between estimates is shorter than the horizon (3.19)."""
+        if not wait < self.horizon:
+            raise InputError(
+                f"the declared longest wait of {wait:g} s is not shorter than the horizon of {self.horizon:g} s: the prior at the "
+                "window's edge would not be estimated yet (thesis 3.19). Lengthen the horizon or bound the wait, "
+                "for example with | MaxInterval(...)"
+            )
+
+    def init(self, *, t: float = 0.0, x: Any, p: Any = None) -> State:
+        """Return the state at the start of estimation.
+
+        Parameters
+        ----------
+        t : float
+            Time t0 in seconds.
+        x : array (nx,) or mapping name -> value
+            Initial estimate chi_hat, model units.
+        p : array (np,) or mapping, optional
+            Initial (or known) parameters; the model's start values when left out.
+        """
+        t = finite_time(t, "init")
+        model = self.model
+        x0 = model.x.vector(x, "init")
+        p0 = model.p.vector(model.p_start if p is None else self._named(model.p, p, model.p_start), "init")
+        inputs = Log(len(model.u))
+        u_start = getattr(model, "u_start", None)
+        if len(model.u) and u_start is not None:
+            inputs = inputs.put(t, frozen(u_start))
+        return State(t, t, frozen(np.concatenate([x0, p0])), x0, p0, Log(len(model.y)), inputs)
+
+    @staticmethod
+    def _named(signals: Signals, values: Any, default: Array) -> Any:
+        """Return a mapping completed by the default values, anything else unchanged."""
+        return dict(zip(signals.names, default, strict=True)) | values if isinstance(values, dict) else values
+
+    def observe(self, state: State, measurement: Measurement) -> State:
+        """Return the state that also knows `measurement`: any order, late, partial (NaN or names left out).
+
+        Raises
+        ------
+        TooLate
+            If it is older than the window of the last estimate.
+        InputError
+            For wrong shapes, unknown names, infinite values, or a sensor that says two different things at one time.
+        """
+        t = measurement.t
+        row = self.model.y.vector(measurement.y, f"measurement at t = {t:g}", missing=np.nan, allow_nan=True)
+        self._check_age(state, t, "measurement", state.t - self.horizon)
+        if not np.isfinite(row).any():
+            return state
+        self._check_step(t, "measurement")
+        known = state.measurements.find(t)
+        if known is not None:
+            conflict = np.isfinite(known) & np.isfinite(row) & (known != row)
+            if conflict.any():
+                i = int(np.flatnonzero(conflict)[0])
+                raise InputError(
+                    f"measurement at t = {t:g}: output {self.model.y.names[i]!r} is {row[i]:g} but was {known[i]:g} at the "
+                    "same time; give each sample its own time"
+                )
+            row = frozen(np.where(np.isfinite(row), row, known))
+        return replace(state, measurements=state.measurements.put(t, row))
+
+    def control(self, state: State, value: Input) -> State:
+        """Return the state that also knows the input from `value.t` on; at one time the last one given counts."""
+        u = self.model.u.vector(value.u, f"input at t = {value.t:g}")
+        if state.solves:
+            self._check_age(state, value.t, "input", state.t - self.horizon)
+        return replace(state, inputs=state.inputs.put(value.t, u))
+
+    def _check_age(self, state: State, t: float, what: str, window: float) -> None:
+        edge = max(state.t0, window)
+        if t < edge - 1e-9 * self.interval:
+            raise TooLate(
+                f"{what} at t = {t:g} s is older than the window, which starts at {edge:g} s; a longer horizon "
+                f"(now {self.horizon:g} s) accepts later arrivals"
+            )
+
+    def _check_step(self, t: float, what: str) -> None:
+        step = self.model.step
+        if step is not None and abs(t - round(t / step) * step) > 1e-6 * step:
+            raise InputError(f"{what} at t = {t:g} s is not at a multiple of the discrete model's step {step:g} s")
+
+    def estimate(self, state: State, t: float) -> tuple[State, Estimate]:
+        """Solve the problem of the window that ends at `t`.
+
+        Parameters
+        ----------
+        state : State
+        t : float
+            Seconds; not before the last estimate.
+
+        Returns
+        -------
+        state : State
+            With the estimate's piece appended to the trajectory (3.16) and what left the horizon dropped.
+        estimate : Estimate
+
+        Raises
+        ------
+        NotEstimated
+            If `t` lies before the last estimate: `smooth` gives that.
+        InputError
+            If no input is known at the window's start for a model with inputs.
+        """
+        began = self.clock()
+        t = finite_time(t, "estimate")
+        if t < state.t - 1e-9 * self.interval:
+            raise NotEstimated(
+                f"estimate at t = {t:g} s lies before the last one at {state.t:g} s; smooth(state, t) gives estimates of the past"
+            )
+        t = max(t, state.t)
+        start = t - self.horizon
+        growing = start <= state.t0 + 1e-9 * self.interval
+        start = state.t0 if growing else start
+        prior, factor, notes = self._prior(state, start, growing)
+        records = self._records(state, t, start)
+        window = self.assembly.window(start, t, records, prior, growing=growing, prior_factor=factor)
+        if not window.L_y.any():
+            notes = (*notes, "no measurement in window")
+        guesses = self._guesses(state, window)
+        solution, status = climb(window, self._solver, lambda: self._reference, guesses, notes)
+        if solution is None:
+            solution = self._open_loop(state, window, start)
+        trajectory = _trajectory(window, solution)
+        estimate = self._to_estimate(window, solution, trajectory, status, began)
+        return self._advance(state, estimate, solution), estimate
+
+    def _prior(self, state: State, start: float, growing: bool) -> tuple[Array, float, tuple[str, ...]]:
+        """Return the prior (3.18), the factor on its weight, and notes.
+
+        In a gap longer than the horizon the trajectory does not reach back to the window's start: the prior is the
+        prediction, and its weight fades by exp(-g / T) on top of the discount's eta^g for a gap of g seconds beyond it.
+        """
+        if growing:
+            return state.start, 1.0, ()
+        if start <= state.t + 1e-9 * self.interval:
+            prior = filtering_prior(self.stage, state.pieces, min(start, state.t))
+            if prior is not None:
+                return prior, 1.0, ()
+        gap = max(start - state.t, 0.0)
+        x = self.propagate(state, state.t, start, state.x, state.p)
+        factor = float(np.exp(-gap * (self.assembly.prior_rate + 1.0 / self.horizon)))
+        return np.concatenate([x, state.p]), factor, ("prior predicted, uncertified",)
+
+    def _records(self, state: State, end: float, start: float) -> Records:
+        y_times, y = state.measurements.arrays(end + 1e-9 * self.interval)
+        u_times, u = state.inputs.arrays(end)
+        if len(self.model.u) and (not len(u_times) or u_times[0] > start + 1e-9 * self.interval):
+            raise InputError(
+                f"no input is known at t = {start:g} s for {', '.join(self.model.u.names)}; give "
+                f"control(state, Input(t={start:g}, u=...)) first"
+            )
+        return Records(y_times, y, u_times, u)
+
+    def _guesses(self, state: State, window: Window) -> list[tuple[str, Guess]]:
+        """Return the warm start (the last solution on the new mesh, carried forward) and the prior carried forward."""
+        nx = self.stage.nx
+        guesses: list[tuple[str, Guess]] = []
+        if state.window is not None:
+            guess = self._warm_start(state, window)
+            if guess is not None:
+                guesses.append(("warm start", guess))
+        x0 = np.clip(window.prior[:nx], window.x_lower[0], window.x_upper[0])
+        try:
+            shifted = rollout(self.stage, window, x0, window.prior[nx:])
+        except FloatingPointError:
+            shifted = None
+        if shifted is None or not np.isfinite(shifted.x).all():
+            n = len(window.mesh)
+            shifted = Guess.of(np.tile(x0, (n + 1, 1)), np.zeros((n, self.stage.nw)), window.prior[nx:], self.stage.ny)
+        guesses.append(("shifted guess", shifted))
+        return guesses
+
+    def _warm_start(self, state: State, window: Window) -> Guess | None:
+        last, mesh, stage = state.window, window.mesh, self.stage
+        assert last is not None
+        n = len(mesh)
+        old = int(np.searchsorted(mesh.t, last.t[-1], side="right"))  # nodes that the last window covers
+        if old == 0:
+            return None
+        x = np.empty((n + 1, stage.nx))
+        for i in range(stage.nx):
+            x[:old, i] = np.interp(mesh.t[:old], last.t, last.x[:, i])
+        middle = mesh.t[:-1] + mesh.h / 2
+        slot = np.clip(np.searchsorted(last.t, middle, side="right") - 1, 0, len(last.w) - 1)
+        inside = (middle >= last.t[0]) & (middle <= last.t[-1])
+        w = np.where(inside[:, None], last.w[slot], 0.0)
+        p = state.p if window.p_estimated else window.prior[stage.nx :]
+        try:
+            for k in range(max(old - 1, 0), n):
+                x[k + 1], _ = stage.step(mesh.t[k], mesh.h[k], x[k], w[k], p, window.u0[k], window.u1[k])
+        except FloatingPointError:
+            return None
+        node = np.clip(np.searchsorted(last.t, mesh.t - mesh.tolerance), 0, len(last.x) - 1)
+        covered = (mesh.t <= last.t[-1] + mesh.tolerance)[:, None]
+        x_active, w_active, y_active, p_active = state.active
+        return Guess(
+            x,
+            w,
+            p,
+            np.where(covered, x_active[node], 0).astype(np.int8),
+            np.where(inside[:, None], w_active[slot], 0).astype(np.int8),
+            np.where(inside[:, None], y_active[slot], 0).astype(np.int8),
+            p_active,
+        )
+
+    def _open_loop(self, state: State, window: Window, start: float) -> Solution:
+        """Return the prediction from the last estimate as a solution, when nothing else gave numbers."""
+        stage, mesh = self.stage, window.mesh
+        n = len(mesh)
+        x = np.empty((n + 1, stage.nx))
+        for k, t in enumerate(mesh.t):
+            if t <= state.t:
+                known = state.window is not None and t >= state.window.t[0]
+                x[k] = trajectory_at(stage, state.window, t) if known and state.window is not None else state.x
+            else:
+                x[k] = x[k - 1] if k else state.x
+                try:
+                    previous = max(mesh.t[k - 1] if k else start, state.t)
+                    x[k] = self.propagate(state, previous, t, state.x if previous <= state.t else x[k - 1], state.p)
+                except FloatingPointError:
+                    pass
+        point = Guess.of(x, np.zeros((n, stage.nw)), state.p, stage.ny)
+        try:
+            _, y = stage.values(mesh.t[:-1], mesh.h, x[:-1], point.w, point.p, window.u0, window.u1)
+        except FloatingPointError:
+            y = np.full((n, stage.q, stage.ny), np.nan)
+        return Solution(point, y, float("nan"), False, "open loop")
+
+    def _to_estimate(
+        self, window: Window, solution: Solution, trajectory: Trajectory, status: Status, began: float
+    ) -> Estimate:
+        def covariance() -> tuple[Array, int]:
+            values, rank = self._gauss_newton.covariance(window, solution.point)
+            return frozen(values), rank
+
+        y = trajectory.y[-1]
+        if self.model.step is not None:
+            u = window.u1[-1] if len(self.model.u) else np.empty(0)
+            w = solution.point.w[-1] if window.mesh.h[-1] == 0 else self._silent
+            y = frozen(
+                np.asarray(self.model.output(window.mesh.t[-1], trajectory.x[-1], u, w, trajectory.p)).reshape(-1)
+            )
+        return Estimate(
+            t=float(window.mesh.t[-1]),
+            x=frozen(trajectory.x[-1]),
+            p=frozen(trajectory.p),
+            w=frozen(trajectory.w[-1]),
+            y=frozen(y),
+            trajectory=trajectory,
+            cost=solution.cost,
+            prior=frozen(window.prior),
+            status=status,
+            seconds=self.clock() - began,
+            _covariance=None if status.outcome is Outcome.PREDICTED else covariance,
+        )
+
+    def _advance(self, state: State, estimate: Estimate, solution: Solution) -> State:
+        t, horizon = estimate.t, self.horizon
+        pieces = state.pieces
+        if t > state.t or not pieces:
+            pieces = (*pieces, Piece.of(estimate.trajectory, state.t))
+        while len(pieces) > 1 and pieces[0].end < t - horizon:
+            pieces = pieces[1:]
+        edge = t - horizon
+        keep = edge - (self.hold_limit if self.assembly.held.any() else 0.0) - 1e-6 * self.interval
+        point = solution.point
+        return replace(
+            state,
+            t=t,
+            x=estimate.x,
+            p=estimate.p,
+            measurements=state.measurements.drop_before(keep),
+            inputs=state.inputs.drop_before(edge - 1e-6 * self.interval, keep_holding=True),
+            pieces=pieces,
+            window=estimate.trajectory,
+            active=(point.x_active, point.w_active, point.y_active, point.p_active),
+            solves=state.solves + 1,
+        )
+
+    def propagate(self, state: State, t0: float, t1: float, x: Array, p: Array) -> Array:
+        """Return the state at `t1` from `x` (nx,) at `t0`, without disturbance, under the inputs that `state` knows.
+
+        The last known input is held. For a `DiscreteModel` both times are multiples of its step.
+        """
+        if t1 <= t0:
+            return x
+        records = Records(np.empty(0), np.empty((0, len(self.model.y))), *state.inputs.arrays(t1))
+        if len(self.model.u) and not len(records.u_times):
+            raise InputError(
+                f"no input is known for {', '.join(self.model.u.names)}; give control(state, Input(...)) first"
+            )
+        mesh = self._prediction_mesh(t0, t1, records)
+        u0, u1 = self._inputs_on(mesh, records)
+        for k in range(len(mesh)):
+            x, _ = self.stage.step(mesh.t[k], mesh.h[k], x, self._silent, p, u0[k], u1[k])
+        return x
+
+    def _prediction_mesh(self, t0: float, t1: float, records: Records) -> Mesh:
+        return self.assembly.mesh(t0, t1, records, growing=False)
+
+    def _inputs_on(self, mesh: Mesh, records: Records) -> tuple[Array, Array]:
+
+        if not len(self.model.u):
+            return np.empty((len(mesh), 0)), np.empty((len(mesh), 0))
+        return held_inputs(records.u_times, records.u, mesh.t, mesh.tolerance, self.assembly.input_linear)
+
+    def output(self, state: State, t: float, x: Array, p: Array) -> Array:
+        """Return the undisturbed output (ny,) at `t` for a given state and parameters, under the known input."""
+        u = np.empty(0)
+        if len(self.model.u):
+            _, rows = state.inputs.arrays(t)
+            u = rows[-1]
+        return np.asarray(self.model.output(t, x, u, self._silent, p)).reshape(-1)
+
+    def predict(self, state: State, t: float) -> Prediction:
+        """Return the open-loop prediction at `t` from the last estimate: no disturbance, the last input held.
+
+        Raises
+        ------
+        NotEstimated
+            If `t` lies before the last estimate.
+        """
+        t = finite_time(t, "predict")
+        if t < state.t - 1e-9 * self.interval:
+            raise NotEstimated(
+                f"prediction at t = {t:g} s lies before the last estimate at {state.t:g} s; use smooth(state, t)"
+            )
+        x = frozen(self.propagate(state, state.t, t, state.x, state.p))
+        return Prediction(t, x, state.p, frozen(self.output(state, t, x, state.p)))
+
+    def smooth(self, state: State, t: float) -> Array:
+        """Return the state (nx,) at a past time `t` from the last window's solution: all data known then.
+
+        Raises
+        ------
+        NotEstimated
+            If `t` lies outside the last window.
+        """
+        t = finite_time(t, "smooth")
+        if state.window is None or not state.window.t[0] <= t <= state.window.t[-1]:
+            span = "no estimate yet" if state.window is None else f"[{state.window.t[0]:g}, {state.window.t[-1]:g}] s"
+            raise NotEstimated(f"smooth at t = {t:g} s: the last window covers {span}")
+        return frozen(trajectory_at(self.stage, state.window, t))
+
+    def trajectory(self, state: State, t: float) -> Array:
+        """Return x_hat(t) (nx,) of the estimated trajectory (3.16), left-continuous, within the last horizon.
+
+        Raises
+        ------
+        NotEstimated
+            If `t` lies outside what the state keeps.
+        """
+        t = finite_time(t, "trajectory")
+        if t == state.t0 and (not state.pieces or state.pieces[0].start == state.t0):
+            return frozen(state.start[: self.stage.nx])
+        value = filtering_prior(self.stage, state.pieces, t)
+        if value is None:
+            raise NotEstimated(
+                f"trajectory at t = {t:g} s: kept is the horizon before the last estimate at {state.t:g} s"
+            )
+        return frozen(value[: self.stage.nx])
+
+    def reference(self, state: State, t: float) -> Estimate:
+        """Solve the window that ends at `t` by IPOPT, for checking; the state is not advanced."""
+        other = MHE(**(self._configuration | {"solver": "ipopt"}))
+        return other.estimate(state, t)[1]
+
+    def save(self, state: State, path: Any) -> None:
+        """Write a state to a versioned file without pickle."""
+        save_state(state, path, self._fingerprint())
+
+    def load(self, path: Any) -> State:
+        """Read a state that an estimator of the same configuration saved."""
+        return load_state(path, self._fingerprint())
+
+    def _fingerprint(self) -> dict[str, Any]:
+        names = {key: list(getattr(self.model, key).names) for key in "xuwpy"}
+        return {"signals": names, "horizon": self.horizon, "interval": self.interval}
+
+
+def _trajectory(window: Window, solution: Solution) -> Trajectory:
+    point = solution.point
+    parts = (window.mesh.t, point.x, point.w, solution.y[:, -1], window.u0, window.u1, point.p)
+    return Trajectory(*(frozen(part) for part in parts))
+
+
+def _positive(what: str, value: float) -> float:
+    number = float(value)
+    if not (np.isfinite(number) and number > 0):
+        raise InputError(f"{what} must be a positive number of seconds, got {value}")
+    return number
+
+
+def _rebuild(configuration: dict[str, Any]) -> MHE:
+    return MHE(**configuration)

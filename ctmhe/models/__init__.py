@@ -1,0 +1,7 @@
+"""Models: continuous, discrete, FMUs, and a library of plants."""
+
+from ctmhe.models.continuous import ContinuousModel, Model
+from ctmhe.models.discrete import DiscreteModel
+from ctmhe.models.signals import Signals
+
+__all__ = ["ContinuousModel", "DiscreteModel", "Model", "Signals"]

@@ -1,0 +1,517 @@
+"""The door to fmpy: what an FMU says of itself, and one interface to its instances for FMI 2.0 and 3.0."""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import os
+import weakref
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ctmhe.errors import FmuError, MissingExtra
+from ctmhe.models.signals import Signals
+from ctmhe.types import Array
+
+log = logging.getLogger(__name__)
+
+MODEL_EXCHANGE, CO_SIMULATION = "ModelExchange", "CoSimulation"
+
+
+def _fmpy() -> Any:
+    try:
+        import fmpy
+        import fmpy.fmi2
+        import fmpy.fmi3
+    except ImportError as error:
+        raise MissingExtra("fmpy", "fmu", "reading an FMU") from error
+    return fmpy
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One real scalar variable of an FMU; `start`, `minimum` and `maximum` are None where not given."""
+
+    name: str
+    reference: int
+    causality: str
+    variability: str
+    initial: str | None
+    unit: str
+    nominal: float
+    start: float | None
+    minimum: float | None
+    maximum: float | None
+
+    @property
+    def settable(self) -> bool:
+        """Whether a value may be given before or during initialization."""
+        if self.variability == "constant" or self.causality == "independent":
+            return False
+        return (
+            self.start is not None
+            or self.causality in {"input", "parameter"}
+            or self.initial in {"exact", "approx"}
+        )
+
+
+@dataclass(frozen=True)
+class Interface:
+    """What an FMU offers as one kind (model exchange or co-simulation)."""
+
+    identifier: str
+    directional_derivatives: bool
+    get_set_state: bool
+    single_instance: bool
+    completed_step: bool
+    variable_step: bool
+
+
+@dataclass(frozen=True)
+class Description:
+    """What an FMU says of itself.
+
+    Attributes
+    ----------
+    version : str
+        `2.0`, `3.0`, ...
+    name, tool, token : str
+        Model name, generating tool, and the identifier that its binary checks.
+    kinds : mapping kind -> Interface
+        Keys `ModelExchange`, `CoSimulation`.
+    variables : mapping name -> Variable
+        All real scalars (aliases included).
+    states, derivatives, inputs, outputs, parameters : tuple of Variable
+        `derivatives[i]` is d `states[i]` / dt. `parameters` are the tunable and the fixed ones.
+    event_indicators : int
+    unsupported : mapping name -> reason
+        Variables that are arrays or structural parameters.
+    step, tolerance : float or None
+        Of the default experiment.
+    """
+
+    version: str
+    name: str
+    tool: str
+    token: str
+    kinds: Mapping[str, Interface]
+    variables: Mapping[str, Variable]
+    states: tuple[Variable, ...]
+    derivatives: tuple[Variable, ...]
+    inputs: tuple[Variable, ...]
+    outputs: tuple[Variable, ...]
+    parameters: tuple[Variable, ...]
+    event_indicators: int
+    unsupported: Mapping[str, str]
+    step: float | None
+    tolerance: float | None
+
+    @property
+    def major(self) -> int:
+        """Major version of the FMI standard, 2 or 3."""
+        return int(self.version.split(".")[0])
+
+    def select(
+        self, role: str, names: Iterable[str] | str | None, known: Sequence[Variable]
+    ) -> tuple[Variable, ...]:
+        """Return the variables of `names` (all of `known` when None), or raise an error that suggests the nearest."""
+        if names is None:
+            return tuple(known)
+        wanted = (names,) if isinstance(names, str) else tuple(names)
+        signals = Signals.of(role, [variable.name for variable in known])
+        return tuple(known[signals.index(name)] for name in wanted)
+
+
+def signals_of(
+    kind: str, variables: Sequence[Variable], prefix: str = "", per_second: bool = False
+) -> Signals:
+    """Return variables as `Signals`; `prefix` and `per_second` make the disturbances that belong to them."""
+    names = [prefix + variable.name for variable in variables]
+    suffix = "/s" if per_second else ""
+    units = {name: v.unit + suffix if v.unit else "" for name, v in zip(names, variables, strict=True)}
+    return Signals.of(kind, names, units, {name: v.nominal for name, v in zip(names, variables, strict=True)})
+
+
+def read_description(folder: Path) -> Description:
+    """Read modelDescription.xml of an unpacked FMU.
+
+    Raises
+    ------
+    FmuError
+        If it cannot be parsed, or the FMI version is neither 2 nor 3.
+    """
+    fmpy = _fmpy()
+    try:
+        root = ElementTree.parse(folder / "modelDescription.xml").getroot()
+    except (ElementTree.ParseError, OSError, ValueError) as error:
+        raise FmuError(f"modelDescription.xml cannot be parsed: {error}; export the FMU again") from error
+    version = root.get("fmiVersion", "")
+    if version != "2.0" and not version.startswith("3."):
+        raise FmuError(
+            f"FMI version {version or 'unknown'!r} is not supported; export the FMU as FMI 2.0 or 3.0"
+        )
+    try:
+        raw = fmpy.read_model_description(str(folder), validate=False)
+        return _description(raw, root)
+    except FmuError:
+        raise
+    except Exception as error:
+        raise FmuError(f"modelDescription.xml is inconsistent: {type(error).__name__}: {error}") from error
+
+
+def _description(raw: Any, root: ElementTree.Element) -> Description:
+    variables: dict[str, Variable] = {}
+    unsupported: dict[str, str] = {}
+    for variable in raw.modelVariables:
+        if variable.causality == "structuralParameter":
+            unsupported[variable.name] = "a structural parameter"
+        elif variable.dimensions:
+            unsupported[variable.name] = "an array"
+        elif variable.type in {"Real", "Float64"}:
+            variables[variable.name] = _variable(variable)
+    derivatives = [unknown.variable for unknown in raw.derivatives if unknown.variable.name in variables]
+    for variable in derivatives:
+        if variable.derivative is None:
+            raise FmuError(f"{variable.name!r} is listed as a derivative but does not say of which state")
+    own = [variables[v.name] for v in raw.modelVariables if v.name in variables and v.alias is None]
+    kinds = {}
+    for kind, interface in ((MODEL_EXCHANGE, raw.modelExchange), (CO_SIMULATION, raw.coSimulation)):
+        element = root.find(kind)
+        if interface is not None and element is not None:
+            kinds[kind] = _interface(interface, element)
+    experiment = raw.defaultExperiment
+    return Description(
+        version=raw.fmiVersion,
+        name=raw.modelName or "",
+        tool=raw.generationTool or "",
+        token=raw.guid or "",
+        kinds=kinds,
+        variables=variables,
+        states=tuple(variables[v.derivative.name] for v in derivatives),
+        derivatives=tuple(variables[v.name] for v in derivatives),
+        inputs=tuple(v for v in own if v.causality == "input"),
+        outputs=tuple(v for v in own if v.causality == "output"),
+        parameters=tuple(
+            v for v in own if v.causality == "parameter" and v.variability in {"fixed", "tunable"}
+        ),
+        event_indicators=raw.numberOfEventIndicators,
+        unsupported=unsupported,
+        step=_number(experiment.stepSize) if experiment else None,
+        tolerance=_number(experiment.tolerance) if experiment else None,
+    )
+
+
+def _variable(raw: Any) -> Variable:
+    declared = raw.declaredType
+    nominal = _number(raw.nominal if raw.nominal is not None else getattr(declared, "nominal", None))
+    if nominal is not None and not (np.isfinite(nominal) and nominal != 0):
+        log.warning("%s: nominal value %s is of no use, 1 is taken", raw.name, nominal)
+        nominal = None
+    return Variable(
+        name=raw.name,
+        reference=int(raw.valueReference),
+        causality=raw.causality or "local",
+        variability=raw.variability or "continuous",
+        initial=raw.initial,
+        unit=raw.unit or getattr(declared, "unit", None) or "",
+        nominal=1.0 if nominal is None else abs(nominal),
+        start=_number(raw.start),
+        minimum=_number(raw.min if raw.min is not None else getattr(declared, "min", None)),
+        maximum=_number(raw.max if raw.max is not None else getattr(declared, "max", None)),
+    )
+
+
+def _number(text: Any) -> float | None:
+    return None if text is None else float(text)
+
+
+def _interface(raw: Any, element: ElementTree.Element) -> Interface:
+    # fmpy 0.3.32 looks for FMI 2's attribute only and so misses the plural of FMI 3: read the XML
+    told = (element.get("providesDirectionalDerivative"), element.get("providesDirectionalDerivatives"))
+    return Interface(
+        identifier=raw.modelIdentifier or "",
+        directional_derivatives=any(value in {"true", "1"} for value in told),
+        get_set_state=bool(raw.canGetAndSetFMUstate),
+        single_instance=bool(raw.canBeInstantiatedOnlyOncePerProcess),
+        completed_step=bool(getattr(raw, "needsCompletedIntegratorStep", False)),
+        variable_step=bool(getattr(raw, "canHandleVariableCommunicationStepSize", True)),
+    )
+
+
+@dataclass(frozen=True)
+class Event:
+    """What an event iteration left behind; `next_time` is infinite when no time event is planned."""
+
+    states_changed: bool
+    next_time: float
+
+
+class Instance:
+    """A running instance of an FMU; the same calls for both FMI versions and both kinds.
+
+    A fresh instance is initialized by `initialize`; a model-exchange instance is then in continuous-time mode, a
+    co-simulation instance ready to step. Vectors are float64 arrays in the order of the variables passed.
+
+    Parameters
+    ----------
+    description : Description
+    folder : Path
+        Where the FMU is unpacked; must exist as long as the instance.
+    kind : str
+        `ModelExchange` or `CoSimulation`.
+
+    Raises
+    ------
+    FmuError
+        If the binary cannot be loaded or refuses; any later failing call names itself and its variables.
+    """
+
+    def __init__(self, description: Description, folder: Path, kind: str):
+        fmpy = _fmpy()
+        if kind not in description.kinds:
+            raise FmuError(
+                f"{description.name} offers {', '.join(description.kinds) or 'nothing'}, not {kind}"
+            )
+        self.description, self.kind = description, kind
+        self.interface = description.kinds[kind]
+        self.messages: deque[str] = deque(maxlen=5)
+        self._version = description.major
+        module = fmpy.fmi2 if self._version == 2 else fmpy.fmi3
+        suffix = "Model" if kind == MODEL_EXCHANGE else "Slave"
+        factory = getattr(module, f"FMU{self._version}{suffix}")
+        here = os.getcwd()
+        try:
+            self._fmu = factory(
+                guid=description.token,
+                modelIdentifier=self.interface.identifier,
+                unzipDirectory=str(folder),
+                instanceName=description.name or "fmu",
+            )
+        except Exception as error:
+            raise FmuError(
+                f"the binary of {description.name} ({self.interface.identifier}) cannot be loaded: {error}. The FMU "
+                f"needs a binary for this platform ({fmpy.platform_tuple})"
+            ) from error
+        finally:
+            os.chdir(here)  # fmpy steps into the FMU's folder and stays there when loading fails
+        self._instantiate(fmpy)
+        self._saved: dict[int, Any] = {}
+        self._free = weakref.finalize(self, _release, self._fmu, self._saved)
+        self._nx, self._nz = len(description.states), description.event_indicators
+        self._derivatives, self._indicators = (ctypes.c_double * self._nx)(), (ctypes.c_double * self._nz)()
+
+    def _instantiate(self, fmpy: Any) -> None:
+        messages = self.messages
+        options: dict[str, Any]
+        if self._version == 2:
+            fmi2 = fmpy.fmi2
+            callbacks = fmi2.fmi2CallbackFunctions()
+            callbacks.logger = fmi2.fmi2CallbackLoggerTYPE(partial(_listen, messages))
+            callbacks.allocateMemory = fmi2.defaultCallbacks.allocateMemory
+            callbacks.freeMemory = fmi2.defaultCallbacks.freeMemory
+            # fmpy's addLoggerProxy would fill in the message's arguments, but keeps one logger for the whole process
+            options = {"callbacks": callbacks}
+        else:
+            options = {"logMessage": partial(_listen, messages)}
+        try:
+            self._fmu.instantiate(**options)
+        except Exception as error:
+            self._fmu.freeLibrary()
+            raise FmuError(
+                f"{self.description.name} cannot be instantiated for {self.kind}{self._told()}. Its binary and its "
+                "modelDescription.xml may not belong together: export it again"
+            ) from error
+
+    def _told(self) -> str:
+        return f"; it says: {' / '.join(self.messages)}" if self.messages else ""
+
+    def _call(self, name: str, *arguments: Any, about: Iterable[str] = ()) -> Any:
+        if not self._free.alive:
+            raise FmuError(f"{self.description.name} is closed; start it again or build a new one")
+        try:
+            return getattr(self._fmu, name)(*arguments)
+        except Exception as error:
+            names = ", ".join(about)
+            raise FmuError(
+                f"{self.description.name}: {name}{f' of {names}' if names else ''} failed: {error}{self._told()}"
+            ) from error
+
+    def initialize(self, t: float, values: Mapping[str, float], tolerance: float | None = None) -> Event:
+        """Initialize at time `t` with start values by name (inputs, parameters, settable states)."""
+        chosen = [self.description.variables[name] for name in values]
+        numbers = list(values.values())
+        if self._version == 2:
+            self.set(chosen, numbers)
+            self._call("setupExperiment", tolerance, t)
+            self._call("enterInitializationMode")
+        else:
+            self.set(chosen, numbers)
+            self._call("enterInitializationMode", tolerance, t)
+        self._call("exitInitializationMode")
+        if self.kind == CO_SIMULATION:
+            return Event(False, np.inf)
+        return self._iterate()
+
+    def event(self) -> Event:
+        """Enter event mode, iterate until nothing changes, return to continuous-time mode (model exchange)."""
+        self._call("enterEventMode")
+        return self._iterate()
+
+    def _iterate(self) -> Event:
+        function = "newDiscreteStates" if self._version == 2 else "updateDiscreteStates"
+        changed, next_time = False, np.inf
+        for _ in range(1000):
+            needed, terminate, _, states, planned, when = self._call(function)
+            changed |= bool(states)
+            next_time = float(when) if planned else np.inf
+            if terminate:
+                raise FmuError(f"{self.description.name} asks to end the simulation{self._told()}")
+            if not needed:
+                self._call("enterContinuousTimeMode")
+                return Event(changed, next_time)
+        raise FmuError(f"{self.description.name}: the event iteration does not end (1000 rounds)")
+
+    def completed_step(self) -> bool:
+        """Tell the FMU that an integration step ended; True when it asks for an event (model exchange)."""
+        enter, terminate = self._call("completedIntegratorStep")
+        if terminate:
+            raise FmuError(f"{self.description.name} asks to end the simulation{self._told()}")
+        return bool(enter)
+
+    def set(self, variables: Sequence[Variable], values: ArrayLike) -> None:
+        """Set real variables."""
+        count = len(variables)
+        if count:
+            numbers = (ctypes.c_double * count)(*np.asarray(values, float).tolist())
+            references = (ctypes.c_uint * count)(*(variable.reference for variable in variables))
+            names = (variable.name for variable in variables)
+            if self._version == 2:
+                self._call("fmi2SetReal", self._fmu.component, references, count, numbers, about=names)
+            else:
+                self._call(
+                    "fmi3SetFloat64", self._fmu.component, references, count, numbers, count, about=names
+                )
+
+    def get(self, variables: Sequence[Variable]) -> Array:
+        """Return real variables."""
+        count = len(variables)
+        numbers = (ctypes.c_double * count)()
+        if count:
+            references = (ctypes.c_uint * count)(*(variable.reference for variable in variables))
+            names = (variable.name for variable in variables)
+            if self._version == 2:
+                self._call("fmi2GetReal", self._fmu.component, references, count, numbers, about=names)
+            else:
+                self._call(
+                    "fmi3GetFloat64", self._fmu.component, references, count, numbers, count, about=names
+                )
+        return np.array(numbers[:], dtype=np.float64)
+
+    def set_time(self, t: float) -> None:
+        """Set the time (model exchange)."""
+        self._call("setTime", float(t))
+
+    def set_states(self, x: Array) -> None:
+        """Set all continuous states (model exchange)."""
+        self._call("setContinuousStates", (ctypes.c_double * self._nx)(*x.tolist()), self._nx)
+
+    def states(self) -> Array:
+        """Return all continuous states (model exchange)."""
+        buffer = (ctypes.c_double * self._nx)()
+        self._call("getContinuousStates", buffer, self._nx)
+        return np.array(buffer[:], dtype=np.float64)
+
+    def derivatives(self) -> Array:
+        """Return dx/dt (model exchange)."""
+        name = "getDerivatives" if self._version == 2 else "getContinuousStateDerivatives"
+        self._call(name, self._derivatives, self._nx)
+        return np.array(self._derivatives[:], dtype=np.float64)
+
+    def event_indicators(self) -> Array:
+        """Return the functions whose sign changes are state events (model exchange)."""
+        if self._nz:
+            self._call("getEventIndicators", self._indicators, self._nz)
+        return np.array(self._indicators[:], dtype=np.float64)
+
+    def directional(self, unknowns: Sequence[Variable], knowns: Sequence[Variable], seed: ArrayLike) -> Array:
+        """Return d unknowns / d knowns times `seed`."""
+        arguments = (
+            [v.reference for v in unknowns],
+            [v.reference for v in knowns],
+            np.asarray(seed, float).tolist(),
+        )
+        names = (variable.name for variable in (*unknowns, *knowns))
+        return np.array(self._call("getDirectionalDerivative", *arguments, about=names), dtype=np.float64)
+
+    def do_step(self, t: float, length: float) -> None:
+        """Advance a co-simulation from `t` by `length` seconds."""
+        answer = self._call("doStep", t, length)
+        if answer is not None and (
+            answer[1] or abs(answer[3] - t - length) > 1e-9 * max(1.0, abs(t), length)
+        ):
+            raise FmuError(
+                f"{self.description.name}: the step from {t} by {length} s ended at {answer[3]}"
+                f"{', asking to end the simulation' if answer[1] else ''}{self._told()}"
+            )
+
+    def save(self) -> SavedState:
+        """Return a copy of everything inside the FMU; needs `interface.get_set_state`."""
+        pointer = self._call("getFMUState")
+        self._saved[id(pointer)] = pointer
+        return SavedState(self, pointer)
+
+    def load(self, saved: SavedState) -> None:
+        """Bring the FMU back to a state that this very instance saved."""
+        if saved.owner() is not self or id(saved.pointer) not in self._saved:
+            raise FmuError(f"{self.description.name}: a saved state is only good for the run that saved it")
+        self._call("setFMUState", saved.pointer)
+
+    def forget(self, pointer: Any) -> None:
+        """Free a saved state."""
+        if self._free.alive and self._saved.pop(id(pointer), None) is not None:
+            self._call("freeFMUState", pointer)
+
+    def close(self) -> None:
+        """Free saved states, the instance and its library; safe to call twice."""
+        self._free()
+
+
+class SavedState:
+    """A state inside an FMU, freed when this object goes away."""
+
+    def __init__(self, instance: Instance, pointer: Any):
+        self.owner = weakref.ref(instance)
+        self.pointer = pointer
+        weakref.finalize(self, _forget, self.owner, pointer).atexit = False
+
+
+def _forget(owner: Callable[[], Instance | None], pointer: Any) -> None:
+    instance = owner()
+    if instance is not None:
+        instance.forget(pointer)
+
+
+def _release(fmu: Any, saved: dict[int, Any]) -> None:
+    try:
+        for pointer in saved.values():
+            fmu.freeFMUState(pointer)
+        saved.clear()
+        fmu.freeInstance()
+    except Exception:
+        log.debug("freeing an FMU failed", exc_info=True)
+
+
+def _listen(messages: deque[str], *arguments: Any) -> None:
+    # FMI 2: environment, instance name, status, category, message; FMI 3: environment, status, category, message
+    status, text = arguments[-3], (arguments[-1] or b"").decode("utf-8", "replace").strip()
+    log.debug("FMU message (status %s): %s", status, text)
+    if status not in (0, None):
+        messages.append(text)

@@ -1,0 +1,19 @@
+"""Plants from the papers and the literature, one function each that returns a `ContinuousModel`."""
+
+from ctmhe.models.library.batch_reactor import batch_reactor
+from ctmhe.models.library.cascaded_tanks import cascaded_tanks
+from ctmhe.models.library.chua import chua
+from ctmhe.models.library.cstr import cstr, cstr_steady_states
+from ctmhe.models.library.quadrotor import hover_speed, quadrotor
+from ctmhe.models.library.van_der_pol import van_der_pol
+
+__all__ = [
+    "batch_reactor",
+    "cascaded_tanks",
+    "chua",
+    "cstr",
+    "cstr_steady_states",
+    "hover_speed",
+    "quadrotor",
+    "van_der_pol",
+]

@@ -1,0 +1,332 @@
+"""Generalized Gauss-Newton on the multiple-shooting problem: linearise, solve the structured QP, globalise, repeat."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctmhe.solvers.base import Multipliers, Solution, clip_to_bounds
+from ctmhe.solvers.quadratic import KKT, ActiveSet, QuadraticProgram, Singular, Step
+from ctmhe.transcription.problem import Guess, Window, bound_violation, cost_of, prior_deviation
+from ctmhe.transcription.stage import Linearization, StageFunction
+from ctmhe.types import Array
+
+ARMIJO = 1e-4
+DAMPING_START, DAMPING_LIMIT = 1e-8, 1e8
+
+
+@dataclass(frozen=True, eq=False)
+class _Iterate:
+    point: Guess
+    linear: Linearization
+    cost: float
+    defect: Array  # (N, nx), scaled
+    y_excess: Array  # (N, ny), scaled violation of the output bounds
+
+    @property
+    def infeasibility(self) -> float:
+        return float(np.abs(self.defect).sum() + self.y_excess.sum())
+
+
+class GaussNewton:
+    """The default solver.
+
+    Each iteration linearises all slots, solves the quadratic program with its bounds, and takes a step that decreases the
+    exact penalty function J/2 + rho (|dynamics defect|_1 + |output bound excess|_1), backtracking where needed; when no step
+    does, a Levenberg term is added and raised. It stops when the decrease that the model predicts falls below `tolerance`
+    relative to the cost and the dynamics hold.
+
+    Parameters
+    ----------
+    stage : StageFunction
+    max_iterations : int
+    tolerance : float
+        Relative predicted decrease of the cost at which a full step is the last.
+    """
+
+    name = "Gauss-Newton"
+
+    def __init__(self, stage: StageFunction, *, max_iterations: int = 50, tolerance: float = 1e-11):
+        self.stage, self.max_iterations, self.tolerance = stage, max_iterations, tolerance
+        self._systems: dict[tuple[bool, bool], KKT] = {}
+
+    def solve(self, window: Window, guess: Guess) -> Solution:
+        """Return the solution from `guess`; never raises for numerical trouble."""
+        key = (window.output_bounded, window.p_estimated)
+        if key not in self._systems:
+            stage = self.stage
+            self._systems[key] = KKT(stage.nx, stage.nw, stage.ny * key[0], stage.np * key[1])
+        kkt = self._systems[key]
+        floor = 1e-14 * self._data_scale(window)
+        factorizations, damping, rho = 0, 0.0, 0.0
+        step: Step | None = None
+        optimality = float("nan")
+        guess = clip_to_bounds(window, guess)
+        active = ActiveSet(guess.x_active, guess.w_active, guess.y_active, guess.p_active[: kkt.np])
+        active = _admissible(window, active, bool(kkt.ny))
+        try:
+            current = self._evaluate(window, guess)
+        except FloatingPointError as error:
+            return self._failed(window, guess, str(error))
+        if not np.isfinite(current.cost):
+            return self._failed(window, guess, "the model is not finite at the guess")
+        message, success = f"no convergence in {self.max_iterations} iterations", False
+        iteration = 0
+        for iteration in range(1, self.max_iterations + 1):
+            qp = self._quadratic_program(window, current, kkt)
+            try:
+                step = kkt.solve(qp, active, damping=damping)
+            except Singular as error:
+                damping = max(10 * damping, DAMPING_START * _typical_curvature(qp))
+                if damping > DAMPING_LIMIT * _typical_curvature(qp):
+                    message = str(error)
+                    break
+                active = _admissible(window, ActiveSet(*(np.zeros_like(a) for a in _parts(active))), bool(kkt.ny))
+                continue
+            factorizations += step.factorizations
+            active = step.active
+            predicted, optimality = self._model_decrease(qp, step)
+            rho = max(
+                rho, 1.5 * float(np.abs(step.dynamics).max(initial=0.0)), 1.5 * float(np.abs(step.zy).max(initial=0.0))
+            )
+            trial, alpha = self._line_search(window, current, step, rho, predicted)
+            if trial is None:
+                damping = max(10 * damping, DAMPING_START * _typical_curvature(qp))
+                if damping > DAMPING_LIMIT * _typical_curvature(qp):
+                    message = "no step decreases the merit function"
+                    break
+                continue
+            damping = 0.0 if damping < DAMPING_START * _typical_curvature(qp) else 0.1 * damping
+            current = trial
+            scale = max(current.cost, floor)
+            small = abs(predicted) <= self.tolerance * scale and alpha == 1.0
+            if (
+                small
+                and float(np.abs(current.defect).max(initial=0.0)) <= 1e-8
+                and current.y_excess.max(initial=0.0) <= 1e-8
+            ):
+                message, success = "converged", True
+                break
+        point = current.point
+        feasibility = max(
+            float(np.abs(current.defect).max(initial=0.0)), bound_violation(window, point, self._y_end(current))
+        )
+        multipliers = None
+        if step is not None:
+            p_active = np.zeros(self.stage.np, dtype=np.int8)
+            p_active[: kkt.np] = active.p
+            ny_active = active.y if kkt.ny else np.zeros((len(window.mesh), self.stage.ny), dtype=np.int8)
+            point = Guess(point.x, point.w, point.p, active.x, active.w, ny_active, p_active)
+            multipliers = Multipliers(step.dynamics, step.zx, step.zw, step.zy, step.zp)
+        return Solution(
+            point,
+            current.linear.y,
+            current.cost,
+            success,
+            message,
+            iteration,
+            optimality,
+            feasibility,
+            factorizations,
+            multipliers,
+        )
+
+    def _data_scale(self, window: Window) -> float:
+        """Return the cost of explaining nothing, used where the cost itself is zero."""
+        data = float(np.sum((window.L_y @ window.y_data[..., None]) ** 2))
+        prior = float(np.sum((window.L_prior @ window.prior[: len(window.L_prior)]) ** 2))
+        return data + prior + 1e-300
+
+    def _y_end(self, current: _Iterate) -> Array:
+        return current.linear.y[:, -1]
+
+    def _evaluate(self, window: Window, point: Guess) -> _Iterate:
+        mesh = window.mesh
+        linear = self.stage.linearize(mesh.t[:-1], mesh.h, point.x[:-1], point.w, point.p, window.u0, window.u1)
+        return self._judge(window, point, linear)
+
+    def _judge(self, window: Window, point: Guess, linear: Linearization) -> _Iterate:
+        defect = (linear.x_next - point.x[1:]) / window.x_scale
+        y_end = linear.y[:, -1]
+        excess = np.maximum(np.maximum(window.y_lower - y_end, y_end - window.y_upper), 0.0) / window.y_scale
+        return _Iterate(point, linear, cost_of(window, point, linear.y), defect, excess)
+
+    def _line_search(
+        self, window: Window, current: _Iterate, step: Step, rho: float, predicted: float
+    ) -> tuple[_Iterate | None, float]:
+        merit = current.cost / 2 + rho * current.infeasibility
+        # directional derivative of the exact penalty along the step: model slope minus removed infeasibility
+        slope = -max(predicted, 0.0) - rho * current.infeasibility
+        noise = 1e-13 * max(merit, 1e-300)
+        alpha = 1.0
+        for _ in range(12):
+            point = self._move(window, current.point, step, alpha)
+            try:
+                trial = self._evaluate(window, point)
+            except FloatingPointError:
+                alpha /= 4
+                continue
+            value = trial.cost / 2 + rho * trial.infeasibility
+            if np.isfinite(value) and value <= merit + ARMIJO * alpha * slope + noise:
+                return trial, alpha
+            alpha /= 2
+        return None, 0.0
+
+    def _move(self, window: Window, point: Guess, step: Step, alpha: float) -> Guess:
+        x = np.clip(point.x + alpha * step.dx * window.x_scale, window.x_lower, window.x_upper)
+        w = point.w + alpha * step.dw * window.w_scale
+        p = point.p.copy()
+        if window.p_estimated:
+            p = np.clip(p + alpha * step.dp * window.p_scale, window.p_lower, window.p_upper)
+        w = np.clip(w, window.w_lower, window.w_upper)
+        return Guess(x, w, p, point.x_active, point.w_active, point.y_active, point.p_active)
+
+    def _model_decrease(self, qp: QuadraticProgram, step: Step) -> tuple[float, float]:
+        """Return the predicted decrease of J/2 along the step, and the scaled stationarity residual before it."""
+        x, w, p = step.dx[:-1], step.dw, step.dp
+        Hx = (qp.Hxx @ x[..., None] + qp.Hxw @ w[..., None])[..., 0] + qp.Hxp @ p
+        Hw = (qp.Hxw.transpose(0, 2, 1) @ x[..., None] + qp.Hww @ w[..., None])[..., 0] + qp.Hwp @ p
+        Hp = qp.Hpp @ p + np.einsum("kip,ki->p", qp.Hxp, x) + np.einsum("kip,ki->p", qp.Hwp, w)
+        slope = float(np.sum(qp.gx * step.dx) + np.sum(qp.gw * w) + qp.gp @ p)
+        curvature = float(np.sum(Hx * x) + np.sum(Hw * w) + Hp @ p)
+        size = max(float(np.abs(g).max(initial=0.0)) for g in (qp.gx, qp.gw, qp.gp, step.dynamics))
+        residual = max(float(np.abs(g).max(initial=0.0)) for g in (Hx, Hw, Hp))
+        return -(slope + curvature / 2), residual / max(size, 1e-300)
+
+    def _quadratic_program(self, window: Window, current: _Iterate, kkt: KKT) -> QuadraticProgram:
+        stage, point, linear = self.stage, current.point, current.linear
+        n, nx, nw, npar = len(window.mesh), stage.nx, stage.nw, kkt.np
+        scale = np.concatenate([window.x_scale, window.w_scale, window.p_scale[:npar]])
+        jacobian = linear.jacobian[:, :, : nx + nw + npar] * scale
+        step_rows = jacobian[:, :nx] / window.x_scale[:, None]
+        output_rows = jacobian[:, nx:].reshape(n, stage.q, stage.ny, -1)
+        rooted = (window.L_y @ output_rows).reshape(n, stage.q * stage.ny, -1)
+        residual = (window.L_y @ (linear.y - window.y_data)[..., None]).reshape(n, -1, 1)
+        H = rooted.transpose(0, 2, 1) @ rooted
+        g = (rooted.transpose(0, 2, 1) @ residual)[..., 0]
+        root_w = window.L_w * window.w_scale
+        Hww = H[:, nx : nx + nw, nx : nx + nw] + root_w.transpose(0, 2, 1) @ root_w
+        gw = g[:, nx : nx + nw] + (root_w.transpose(0, 2, 1) @ (window.L_w @ point.w[..., None]))[..., 0]
+        gx = np.vstack([g[:, :nx], np.zeros((1, nx))])
+        Hxx, Hxp = H[:, :nx, :nx].copy(), H[:, :nx, nx + nw :].copy()
+        Hpp, gp = H[:, nx + nw :, nx + nw :].sum(axis=0), g[:, nx + nw :].sum(axis=0)
+        root_prior = window.L_prior * np.concatenate([window.x_scale, window.p_scale])[: len(window.L_prior)]
+        prior_gradient = root_prior.T @ (window.L_prior @ prior_deviation(window, point))
+        prior_hessian = root_prior.T @ root_prior
+        Hxx[0] += prior_hessian[:nx, :nx]
+        gx[0] += prior_gradient[:nx]
+        if npar:
+            Hxp[0] += prior_hessian[:nx, nx:]
+            Hpp += prior_hessian[nx:, nx:]
+            gp = gp + prior_gradient[nx:]
+        end = output_rows[:, -1] / window.y_scale[:, None]
+        y_end = linear.y[:, -1]
+        ny = kkt.ny
+        x_lower, x_upper = (window.x_lower - point.x) / window.x_scale, (window.x_upper - point.x) / window.x_scale
+        w_lower, w_upper = (window.w_lower - point.w) / window.w_scale, (window.w_upper - point.w) / window.w_scale
+        x_lower, x_upper, w_lower, w_upper = _without_copies(window, x_lower, x_upper, w_lower, w_upper)
+        return QuadraticProgram(
+            Hxx=Hxx,
+            Hxw=H[:, :nx, nx : nx + nw],
+            Hww=Hww,
+            Hxp=Hxp,
+            Hwp=H[:, nx : nx + nw, nx + nw :],
+            Hpp=Hpp,
+            gx=gx,
+            gw=gw,
+            gp=gp,
+            A=step_rows[:, :, :nx],
+            B=step_rows[:, :, nx : nx + nw],
+            E=step_rows[:, :, nx + nw :],
+            c=current.defect,
+            C=end[:, :ny, :nx],
+            D=end[:, :ny, nx : nx + nw],
+            F=end[:, :ny, nx + nw :],
+            x_lower=x_lower,
+            x_upper=x_upper,
+            w_lower=w_lower,
+            w_upper=w_upper,
+            y_lower=((window.y_lower - y_end) / window.y_scale)[:, :ny],
+            y_upper=((window.y_upper - y_end) / window.y_scale)[:, :ny],
+            p_lower=((window.p_lower - point.p) / window.p_scale)[:npar],
+            p_upper=((window.p_upper - point.p) / window.p_scale)[:npar],
+            shared=window.mesh.shared,
+        )
+
+    def covariance(self, window: Window, point: Guess) -> tuple[Array, int]:
+        """Return the covariance of (x at the window's end, estimated p) and the number of determined directions.
+
+        The inverse of half the Gauss-Newton Hessian of J, reduced by the dynamics; active bounds are ignored. Found from the
+        KKT system with two small regularisations: directions whose variance grows in proportion are not determined, and
+        the variances of the signals in them are infinite.
+        """
+        stage = self.stage
+        kkt = KKT(stage.nx, stage.nw, 0, stage.np * window.p_estimated)
+        qp = self._quadratic_program(window, self._evaluate(window, point), kkt)
+        scale = np.concatenate([window.x_scale, window.p_scale[: kkt.np]])
+        weight = _typical_curvature(qp)
+        small, large = (kkt.end_covariance(qp, factor * weight) for factor in (1e-13, 1e-12))
+        values, vectors = np.linalg.eigh((small + small.T) / 2)
+        shrunk = np.einsum("ji,jk,ki->i", vectors, large, vectors)
+        undetermined = values > 3.0 * np.abs(shrunk)
+        rank = int(len(values) - undetermined.sum())
+        kept = vectors[:, ~undetermined]
+        covariance = kept @ np.diag(values[~undetermined]) @ kept.T
+        if not undetermined.any():
+            try:
+                exact = kkt.end_covariance(qp, 0.0)
+                covariance = (exact + exact.T) / 2
+            except Singular:
+                pass
+        covariance = covariance * scale[:, None] * scale
+        for i in np.flatnonzero((np.abs(vectors[:, undetermined]) > 1e-5).any(axis=1)):
+            covariance[i, :] = covariance[:, i] = np.nan
+            covariance[i, i] = np.inf
+        return covariance, rank
+
+    def _failed(self, window: Window, guess: Guess, message: str) -> Solution:
+        y = np.full((len(window.mesh), self.stage.q, self.stage.ny), np.nan)
+        return Solution(guess, y, float("inf"), False, message)
+
+
+def _parts(active: ActiveSet) -> tuple[np.ndarray, ...]:
+    return active.x, active.w, active.y, active.p
+
+
+def _typical_curvature(qp: QuadraticProgram) -> float:
+    largest = max(float(np.abs(H).max(initial=0.0)) for H in (qp.Hxx, qp.Hww, qp.Hpp))
+    return largest if largest > 0 else 1.0
+
+
+def _without_copies(window: Window, *bounds: Array) -> tuple[Array, ...]:
+    """Drop bounds on copies: w of a slot that shares it with the one before, x behind a slot of no length."""
+    shared, still = window.mesh.shared[:-1], window.mesh.h == 0.0
+    result = []
+    for i, bound in enumerate(bounds):
+        copied = np.concatenate([[False], still if i < 2 else shared])
+        if copied.any():
+            bound = np.where(copied[:, None], -np.inf if i % 2 == 0 else np.inf, bound)
+        result.append(bound)
+    return tuple(result)
+
+
+def _admissible(window: Window, active: ActiveSet, output_bounded: bool) -> ActiveSet:
+    """Return the guess of an active set without entries whose bound is infinite or a copy."""
+    x_lower, x_upper, w_lower, w_upper = _without_copies(
+        window, window.x_lower, window.x_upper, window.w_lower, window.w_upper
+    )
+    n_p = len(active.p)
+    y = active.y if output_bounded else active.y[:, :0]
+    ny = y.shape[1]
+    triples = (
+        (active.x, x_lower, x_upper),
+        (active.w, w_lower, w_upper),
+        (y, window.y_lower[:, :ny], window.y_upper[:, :ny]),
+        (active.p, window.p_lower[:n_p], window.p_upper[:n_p]),
+    )
+    cleaned = []
+    for held, lower, upper in triples:
+        possible = np.where(held < 0, np.isfinite(lower), np.isfinite(upper)) & (held != 0)
+        cleaned.append(np.where(lower == upper, 1, np.where(possible, held, 0)).astype(np.int8))
+    return ActiveSet(*cleaned)

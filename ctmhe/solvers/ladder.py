@@ -1,0 +1,92 @@
+"""What to do when a solve fails: warm start, shifted guess, reference solver, relaxed bounds, open loop."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ctmhe.solvers.base import Solution, Solver
+from ctmhe.transcription.problem import Guess, Window, bound_violation
+from ctmhe.types import Outcome, Status
+
+logger = logging.getLogger(__name__)
+
+
+def climb(
+    window: Window,
+    solver: Solver,
+    reference: Callable[[], Solver],
+    guesses: Sequence[tuple[str, Guess]],
+    notes: tuple[str, ...],
+) -> tuple[Solution | None, Status]:
+    """Try each rung until one succeeds.
+
+    Parameters
+    ----------
+    window : Window
+    solver : Solver
+        The solver of choice.
+    reference : callable returning a Solver
+        The reference solver, built only when needed.
+    guesses : sequence of (name, Guess)
+        Warm start first, then the shifted guess (the prior carried forward).
+    notes : tuple of str
+        Facts about the window for the status.
+
+    Returns
+    -------
+    solution : Solution or None
+        None when no rung gave finite numbers: the caller predicts open loop.
+    status : Status
+    """
+    rungs: list[str] = []
+    attempts: list[Solution] = []
+
+    def run(name: str, use: Solver, problem: Window, guess: Guess) -> Solution:
+        solution = use.solve(problem, guess)
+        if not solution.success:
+            rungs.append(f"{name} ({use.name}): {solution.message}")
+            logger.debug("rung failed: %s", rungs[-1])
+        return solution
+
+    for name, guess in guesses:
+        solution = run(name, solver, window, guess)
+        if solution.success:
+            return solution, _status(Outcome.SOLVED, solution, rungs, notes)
+        attempts.append(solution)
+    usable = [a for a in attempts if np.isfinite(a.cost)]
+    start = min(usable, key=lambda a: a.feasibility + a.cost * 1e-12).point if usable else guesses[-1][1]
+    if solver.name != reference().name:
+        for guess in (start, guesses[-1][1]):
+            solution = run("reference", reference(), window, guess)
+            if solution.success:
+                return solution, _status(Outcome.FALLBACK, solution, rungs, notes)
+            attempts.append(solution)
+    feasible = [a for a in attempts if np.isfinite(a.cost) and a.feasibility < 1e-6]
+    if feasible:
+        best = min(feasible, key=lambda a: a.cost)
+        return best, _status(Outcome.ITERATION_LIMIT, best, rungs, notes)
+    relaxed = window.relaxed()
+    for use in (solver, reference()):
+        solution = run("relaxed bounds", use, relaxed, guesses[-1][1])
+        if solution.success:
+            violation = bound_violation(window, solution.point, solution.y[:, -1])
+            status = _status(Outcome.RELAXED, solution, rungs, notes)
+            return solution, replace(status, violation=violation)
+    return None, Status(Outcome.PREDICTED, False, rungs=tuple(rungs), notes=notes)
+
+
+def _status(outcome: Outcome, solution: Solution, rungs: Sequence[str], notes: tuple[str, ...]) -> Status:
+    return Status(
+        outcome,
+        solution.success and outcome is not Outcome.RELAXED,
+        solution.iterations,
+        solution.optimality,
+        solution.feasibility,
+        0.0,
+        tuple(rungs),
+        notes,
+    )

@@ -1,0 +1,83 @@
+"""The mesh of a window: slots between the union of cell edges, steps, measurements and input switches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ctmhe.types import Array
+
+ROUND_OFF = 1e-9  # times the shooting interval: edges closer than this are the same instant
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Slots of a window.
+
+    Attributes
+    ----------
+    t : array (N+1,)
+        Edges in seconds; the first and last are the window's.
+    h : array (N,)
+        Lengths; a slot may have length zero.
+    shared : bool array (N,)
+        Slot k+1 lies in the same disturbance cell as slot k and shares its w (False at the last).
+    cell : int array (N,)
+        Absolute number of the disturbance cell: cell j spans [j interval, (j+1) interval].
+    tolerance : float
+        Seconds below which two instants are the same.
+    """
+
+    t: Array
+    h: Array
+    shared: np.ndarray
+    cell: np.ndarray
+    tolerance: float
+
+    def __len__(self) -> int:
+        return len(self.h)
+
+
+def build_mesh(
+    start: float, end: float, interval: float, parts: int, instants: Array, *, sample_at_start: bool
+) -> Mesh:
+    """Return the mesh of [start, end].
+
+    Parameters
+    ----------
+    start, end : float
+        The window's edges.
+    interval : float
+        Length of a disturbance cell; cells are anchored at its absolute multiples, whatever the window's edges.
+    parts : int
+        Integration steps a cell, anchored likewise.
+    instants : array
+        Measurement times and input switches, in any order, also outside the window.
+    sample_at_start : bool
+        Put a slot of length zero in front, whose end is the window's start: a sample there has its residual at once.
+    """
+    tolerance = ROUND_OFF * interval
+    first, last = int(np.floor(start / interval * parts)), int(np.ceil(end / interval * parts))
+    k = np.arange(first, last + 1)
+    steps = (k // parts) * interval + (k % parts) * (interval / parts)
+    inside = np.concatenate([steps, instants])
+    inside = np.sort(inside[(inside > start + tolerance) & (inside < end - tolerance)])
+    if len(inside):
+        inside = inside[np.concatenate([[True], np.diff(inside) > tolerance])]
+    edges = np.concatenate([[start], inside, [end]])
+    if sample_at_start and end > start:
+        edges = np.concatenate([[start], edges])
+    h = np.diff(edges)
+    cell = np.floor((edges[:-1] + 0.5 * h) / interval + ROUND_OFF).astype(np.int64)
+    if sample_at_start and end > start:
+        cell[0] = cell[1]
+    shared = np.concatenate([cell[1:] == cell[:-1], [False]])
+    return Mesh(edges, h, shared, cell, tolerance)
+
+
+def discounted_length(t: Array, h: Array, end: float, rate: float) -> Array:
+    """Return the integral of exp(-rate (end - tau)) over each slot [t, t + h], exact and stable for small rate h."""
+    if rate == 0.0:
+        return h.copy()
+    return np.exp(-rate * (end - t - h)) * (-np.expm1(-rate * h)) / rate

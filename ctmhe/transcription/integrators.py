@@ -1,0 +1,159 @@
+"""Integrators of one slot: fixed-step Runge-Kutta and CVODES, as configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import casadi as ca
+import numpy as np
+
+from ctmhe.errors import InputError
+from ctmhe.models.continuous import Model
+from ctmhe.types import Array
+
+
+class Integrator(Protocol):
+    """Carries the state over one slot and visits the nodes of the output integral.
+
+    `nodes` and `weights` are the quadrature of the slot [0, 1]: the integral of g is the sum of weights * g(nodes).
+    """
+
+    nodes: Array
+    weights: Array
+
+    def parts(self, interval: float) -> int:
+        """Return into how many equal steps a cell of `interval` seconds is divided."""
+        ...
+
+    def trace(self, model: Model, signal: bool) -> ca.Function:
+        """Return the function (t, h, x, w, p, u0, u1) -> (x_next, y) over one slot of h seconds.
+
+        y (ny, q+1): outputs at the q nodes (none unless `signal`), then at the slot's end.
+        """
+        ...
+
+
+def slot_symbols(model: Model, kind: Any) -> list[Any]:
+    """Return the symbols (t, h, x, w, p, u0, u1) of a slot."""
+    sizes = {"t": 1, "h": 1, "x": len(model.x), "w": len(model.w), "p": len(model.p)}
+    sizes |= {"u0": len(model.u), "u1": len(model.u)}
+    return [kind.sym(name, size) for name, size in sizes.items()]
+
+
+def is_symbolic(model: Model) -> bool:
+    """Return whether the model is made of scalar symbols, so that its functions can be expanded."""
+    return model.dynamics.is_a("SXFunction") and model.output.is_a("SXFunction")
+
+
+@dataclass(frozen=True)
+class RK4:
+    """The classic Runge-Kutta method of order 4, one step a slot.
+
+    The output integral is the augmented RK4: residuals at the four stages with weights h/6, h/3, h/3, h/6.
+
+    Parameters
+    ----------
+    step : float
+        Largest step in seconds.
+    """
+
+    step: float
+
+    nodes = np.array([0.0, 0.5, 0.5, 1.0])
+    weights = np.array([1.0, 2.0, 2.0, 1.0]) / 6.0
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.step) and self.step > 0):
+            raise InputError(f"RK4: step must be a positive number of seconds, got {self.step}")
+
+    def parts(self, interval: float) -> int:
+        """Return the number of equal steps, none longer than `step`, in a cell."""
+        return max(1, int(np.ceil(interval / self.step * (1 - 1e-9))))
+
+    def trace(self, model: Model, signal: bool) -> ca.Function:
+        """Return (t, h, x, w, p, u0, u1) -> (x_next, y): see `Integrator`."""
+        symbols = slot_symbols(model, ca.SX if is_symbolic(model) else ca.MX)
+        t, h, x, w, p, u0, u1 = symbols
+        middle = (u0 + u1) / 2
+        k1 = model.dynamics(t, x, u0, w, p)
+        x2 = x + h / 2 * k1
+        k2 = model.dynamics(t + h / 2, x2, middle, w, p)
+        x3 = x + h / 2 * k2
+        k3 = model.dynamics(t + h / 2, x3, middle, w, p)
+        x4 = x + h * k3
+        k4 = model.dynamics(t + h, x4, u1, w, p)
+        end = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        outputs = [model.output(t + h, end, u1, w, p)]
+        if signal:
+            stages = ((t, x, u0), (t + h / 2, x2, middle), (t + h / 2, x3, middle), (t + h, x4, u1))
+            outputs = [model.output(*stage, w, p) for stage in stages] + outputs
+        return ca.Function("slot", symbols, [end, ca.horzcat(*outputs)])
+
+
+@dataclass(frozen=True)
+class CVODES:
+    """SUNDIALS CVODES (variable-order BDF) over each slot, with forward sensitivities; for stiff models.
+
+    The output integral uses the three Gauss nodes of the slot (order 6).
+
+    Parameters
+    ----------
+    rtol, atol : float
+        Error tolerances, relative and in the model's units times the signals' nominals.
+    """
+
+    rtol: float = 1e-8
+    atol: float = 1e-10
+
+    nodes = np.array([0.5 - np.sqrt(0.15), 0.5, 0.5 + np.sqrt(0.15)])
+    weights = np.array([5.0, 8.0, 5.0]) / 18.0
+
+    def __post_init__(self) -> None:
+        for name in ("rtol", "atol"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise InputError(f"CVODES: {name} must be positive, got {value}")
+
+    def parts(self, interval: float) -> int:
+        """Return 1: CVODES chooses its steps itself."""
+        return 1
+
+    def trace(self, model: Model, signal: bool) -> ca.Function:
+        """Return (t, h, x, w, p, u0, u1) -> (x_next, y): see `Integrator`."""
+        kind: Any = ca.SX if is_symbolic(model) else ca.MX
+        t, h, x, w, p, u0, u1 = slot_symbols(model, kind)
+        s = kind.sym("s")
+        scale = ca.DM(np.asarray(model.x.nominal))
+        parameters = ca.vertcat(t, h, w, p, u0, u1)
+        rate = h * model.dynamics(t + s * h, x * scale, u0 + s * (u1 - u0), w, p) / scale
+        grid = [*self.nodes, 1.0] if signal else [1.0]
+        options = {"reltol": self.rtol, "abstol": self.atol, "max_num_steps": 100_000}
+        flow = ca.integrator("flow", "cvodes", {"x": x, "t": s, "p": parameters, "ode": rate}, 0.0, grid, options)
+        symbols = slot_symbols(model, ca.MX)
+        t, h, x, w, p, u0, u1 = symbols
+        states = flow(x0=x / scale, p=ca.vertcat(t, h, w, p, u0, u1))["xf"]
+        outputs = [model.output(t + c * h, states[:, i] * scale, u0 + c * (u1 - u0), w, p) for i, c in enumerate(grid)]
+        return ca.Function("slot", symbols, [states[:, -1] * scale, ca.horzcat(*outputs)])
+
+
+@dataclass(frozen=True)
+class StepMap:
+    """The model's own step map: what a `DiscreteModel` uses. The output belongs to the slot's start.
+
+    A slot of length zero leaves the state where it is: the filtering form ends with one, to count the newest measurement.
+    """
+
+    nodes = np.empty(0)
+    weights = np.empty(0)
+
+    def parts(self, interval: float) -> int:
+        """Return 1: a cell is a step."""
+        return 1
+
+    def trace(self, model: Model, signal: bool) -> ca.Function:
+        """Return (t, h, x, w, p, u0, u1) -> (x_next, y) with y taken at the start of the step."""
+        symbols = slot_symbols(model, ca.SX if is_symbolic(model) else ca.MX)
+        t, h, x, w, p, u0, _ = symbols
+        x_next = ca.if_else(h > 0, model.dynamics(t, x, u0, w, p), x)
+        return ca.Function("slot", symbols, [x_next, model.output(t, x, u0, w, p)])
