@@ -75,7 +75,7 @@ class Log:
         return Log(self.width, _Shared(times, rows), 0, len(times))
 
     def drop_before(self, t: float, *, keep_holding: bool = False) -> Log:
-        """Return the log without rows older than `t`; `keep_holding` keeps the last of them, whose value still holds."""
+        """Return the log without rows older than `t`; `keep_holding` keeps the last of them, which still holds."""
         start = bisect_left(self._shared.times, t, self._start, self._stop)
         if keep_holding and start > self._start and (start == self._stop or self._shared.times[start] > t):
             start -= 1
@@ -135,7 +135,7 @@ class MeasurementLog:
             if bad.any():
                 row, column = (int(i[0]) for i in np.nonzero(bad))
                 raise InputError(
-                    f"log: {names[column]!r} is {table[row, column]} at t = {t[row]}; leave missing outputs empty (NaN), "
+                    f"log: {names[column]!r} is {table[row, column]} at t = {t[row]}; leave missing outputs empty, "
                     "fill missing inputs before loading"
                 )
         object.__setattr__(self, "t", t)
@@ -218,6 +218,6 @@ def _numbers(column: Any, name: str) -> Array:
     import pandas as pd
 
     try:
-        return pd.to_numeric(column).to_numpy(dtype=np.float64)
+        return np.asarray(pd.to_numeric(column), dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"log: column {name!r} holds values that are not numbers: {error}") from None

@@ -62,8 +62,8 @@ class Prediction:
 class MHE:
     """Moving horizon estimator: configuration and compiled functions, immutable once built.
 
-    All that changes lives in an explicit state: `state = mhe.init(...)`, then `control`, `observe` and `estimate`, each of which
-    returns a new state and leaves the old one valid.
+    All that changes lives in an explicit state: `state = mhe.init(...)`, then `control`, `observe` and `estimate`,
+    each of which returns a new state and leaves the old one valid.
 
     Parameters
     ----------
@@ -77,13 +77,13 @@ class MHE:
     integrator : RK4 or CVODES, optional
         Not for a `DiscreteModel`, which has its own step map.
     cost : DiscountedCost
-        Weights and discount. A prior weight over states only holds the parameters at their given values; one over states
-        and parameters estimates them.
+        Weights and discount. A prior weight over states only holds the parameters at their given values; one over
+        states and parameters estimates them.
     bounds : Bounds, optional
         Imposed on x at every node, w, p, and y and the output residual at slot ends.
     hold : {"zero", "linear", "point"} or mapping output -> one of these, optional
-        `zero` and `linear` rebuild the whole signal from the samples, weighted by R; `point` counts each sample at its own
-        time, weighted by R_point. Default `zero`.
+        `zero` and `linear` rebuild the whole signal from the samples, weighted by R; `point` counts each sample at
+        its own time, weighted by R_point. Default `zero`.
     hold_limit : float, optional
         Seconds for which a held sample counts when its sensor falls silent; the horizon when left out.
     input_hold : {"zero", "linear"}
@@ -100,8 +100,8 @@ class MHE:
     Raises
     ------
     InputError
-        For lengths that are not positive, weights and bounds that do not fit, unknown names, and a declared wait that is not
-        shorter than the horizon.
+        For lengths that are not positive, weights and bounds that do not fit, unknown names, and a declared wait that
+        is not shorter than the horizon.
     """
 
     def __init__(
@@ -122,7 +122,8 @@ class MHE:
         max_iterations: int = 50,
         clock: Callable[[], float] = time.perf_counter,
     ):
-        self._configuration = {key: value for key, value in locals().items() if key not in ("self", "__class__")}
+        given = locals()
+        self._configuration: dict[str, Any] = {key: given[key] for key in given if key not in ("self", "__class__")}
         self.model, self.clock = model, clock
         self.horizon = _positive("horizon", horizon)
         if model.step is not None:
@@ -178,7 +179,8 @@ class MHE:
         """Raise `InputError` unless a declared longest wait between estimates is shorter than the horizon (3.19)."""
         if not wait < self.horizon:
             raise InputError(
-                f"the declared longest wait of {wait:g} s is not shorter than the horizon of {self.horizon:g} s: the prior at the "
+                f"the declared longest wait of {wait:g} s is not shorter than the horizon of "
+                f"{self.horizon:g} s: the prior at the "
                 "window's edge would not be estimated yet (thesis 3.19). Lengthen the horizon or bound the wait, "
                 "for example with | MaxInterval(...)"
             )
@@ -232,7 +234,8 @@ class MHE:
             if conflict.any():
                 i = int(np.flatnonzero(conflict)[0])
                 raise InputError(
-                    f"measurement at t = {t:g}: output {self.model.y.names[i]!r} is {row[i]:g} but was {known[i]:g} at the "
+                    f"measurement at t = {t:g}: output {self.model.y.names[i]!r} is {row[i]:g} "
+                    f"but was {known[i]:g} at the "
                     "same time; give each sample its own time"
                 )
             row = frozen(np.where(np.isfinite(row), row, known))
@@ -284,7 +287,8 @@ class MHE:
         t = finite_time(t, "estimate")
         if t < state.t - 1e-9 * self.interval:
             raise NotEstimated(
-                f"estimate at t = {t:g} s lies before the last one at {state.t:g} s; smooth(state, t) gives estimates of the past"
+                f"estimate at t = {t:g} s lies before the last one at {state.t:g} s; "
+                "smooth(state, t) gives estimates of the past"
             )
         t = max(t, state.t)
         start = t - self.horizon
@@ -541,7 +545,7 @@ class MHE:
 
     def reference(self, state: State, t: float) -> Estimate:
         """Solve the window that ends at `t` by IPOPT, for checking; the state is not advanced."""
-        other = MHE(**(self._configuration | {"solver": "ipopt"}))
+        other = _rebuild(self._configuration | {"solver": "ipopt"})
         return other.estimate(state, t)[1]
 
     def save(self, state: State, path: Any) -> None:

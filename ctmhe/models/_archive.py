@@ -1,4 +1,4 @@
-"""Open an FMU's archive safely: every entry is judged before anything is written, into a folder that goes away."""
+"""Open an FMU's archive safely: entries are judged first, then unpacked into a folder that goes away."""
 
 from __future__ import annotations
 
@@ -78,9 +78,7 @@ def _extract(path: Path, folder: Path) -> None:
     ) as error:
         if isinstance(error, FmuError):
             raise
-        raise FmuError(
-            f"{path.name} is not a readable FMU (a zip archive): {error}; export it again"
-        ) from error
+        raise FmuError(f"{path.name} is not a readable FMU (a zip archive): {error}; export it again") from error
     if not (folder / "modelDescription.xml").is_file():
         raise FmuError(f"{path.name} has no modelDescription.xml at its top level, so it is not an FMU")
 
@@ -97,6 +95,4 @@ def _check_entry(path: Path, entry: zipfile.ZipInfo) -> None:
     }
     for reason, met in reasons.items():
         if met:
-            raise FmuError(
-                f"{path.name}: archive entry {name!r} is refused because {reason}; nothing was unpacked"
-            )
+            raise FmuError(f"{path.name}: archive entry {name!r} is refused because {reason}; nothing was unpacked")

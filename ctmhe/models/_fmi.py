@@ -5,6 +5,8 @@ from __future__ import annotations
 import ctypes
 import logging
 import os
+import platform
+import sys
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,12 +20,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctmhe.errors import FmuError, MissingExtra
-from ctmhe.models.signals import Signals
+from ctmhe.models._fmu_description import CO_SIMULATION, MODEL_EXCHANGE, Description, Interface, Variable
 from ctmhe.types import Array
 
 log = logging.getLogger(__name__)
-
-MODEL_EXCHANGE, CO_SIMULATION = "ModelExchange", "CoSimulation"
 
 
 def _fmpy() -> Any:
@@ -34,110 +34,6 @@ def _fmpy() -> Any:
     except ImportError as error:
         raise MissingExtra("fmpy", "fmu", "reading an FMU") from error
     return fmpy
-
-
-@dataclass(frozen=True)
-class Variable:
-    """One real scalar variable of an FMU; `start`, `minimum` and `maximum` are None where not given."""
-
-    name: str
-    reference: int
-    causality: str
-    variability: str
-    initial: str | None
-    unit: str
-    nominal: float
-    start: float | None
-    minimum: float | None
-    maximum: float | None
-
-    @property
-    def settable(self) -> bool:
-        """Whether a value may be given before or during initialization."""
-        if self.variability == "constant" or self.causality == "independent":
-            return False
-        return (
-            self.start is not None
-            or self.causality in {"input", "parameter"}
-            or self.initial in {"exact", "approx"}
-        )
-
-
-@dataclass(frozen=True)
-class Interface:
-    """What an FMU offers as one kind (model exchange or co-simulation)."""
-
-    identifier: str
-    directional_derivatives: bool
-    get_set_state: bool
-    single_instance: bool
-    completed_step: bool
-    variable_step: bool
-
-
-@dataclass(frozen=True)
-class Description:
-    """What an FMU says of itself.
-
-    Attributes
-    ----------
-    version : str
-        `2.0`, `3.0`, ...
-    name, tool, token : str
-        Model name, generating tool, and the identifier that its binary checks.
-    kinds : mapping kind -> Interface
-        Keys `ModelExchange`, `CoSimulation`.
-    variables : mapping name -> Variable
-        All real scalars (aliases included).
-    states, derivatives, inputs, outputs, parameters : tuple of Variable
-        `derivatives[i]` is d `states[i]` / dt. `parameters` are the tunable and the fixed ones.
-    event_indicators : int
-    unsupported : mapping name -> reason
-        Variables that are arrays or structural parameters.
-    step, tolerance : float or None
-        Of the default experiment.
-    """
-
-    version: str
-    name: str
-    tool: str
-    token: str
-    kinds: Mapping[str, Interface]
-    variables: Mapping[str, Variable]
-    states: tuple[Variable, ...]
-    derivatives: tuple[Variable, ...]
-    inputs: tuple[Variable, ...]
-    outputs: tuple[Variable, ...]
-    parameters: tuple[Variable, ...]
-    event_indicators: int
-    unsupported: Mapping[str, str]
-    step: float | None
-    tolerance: float | None
-
-    @property
-    def major(self) -> int:
-        """Major version of the FMI standard, 2 or 3."""
-        return int(self.version.split(".")[0])
-
-    def select(
-        self, role: str, names: Iterable[str] | str | None, known: Sequence[Variable]
-    ) -> tuple[Variable, ...]:
-        """Return the variables of `names` (all of `known` when None), or raise an error that suggests the nearest."""
-        if names is None:
-            return tuple(known)
-        wanted = (names,) if isinstance(names, str) else tuple(names)
-        signals = Signals.of(role, [variable.name for variable in known])
-        return tuple(known[signals.index(name)] for name in wanted)
-
-
-def signals_of(
-    kind: str, variables: Sequence[Variable], prefix: str = "", per_second: bool = False
-) -> Signals:
-    """Return variables as `Signals`; `prefix` and `per_second` make the disturbances that belong to them."""
-    names = [prefix + variable.name for variable in variables]
-    suffix = "/s" if per_second else ""
-    units = {name: v.unit + suffix if v.unit else "" for name, v in zip(names, variables, strict=True)}
-    return Signals.of(kind, names, units, {name: v.nominal for name, v in zip(names, variables, strict=True)})
 
 
 def read_description(folder: Path) -> Description:
@@ -155,9 +51,7 @@ def read_description(folder: Path) -> Description:
         raise FmuError(f"modelDescription.xml cannot be parsed: {error}; export the FMU again") from error
     version = root.get("fmiVersion", "")
     if version != "2.0" and not version.startswith("3."):
-        raise FmuError(
-            f"FMI version {version or 'unknown'!r} is not supported; export the FMU as FMI 2.0 or 3.0"
-        )
+        raise FmuError(f"FMI version {version or 'unknown'!r} is not supported; export the FMU as FMI 2.0 or 3.0")
     try:
         raw = fmpy.read_model_description(str(folder), validate=False)
         return _description(raw, root)
@@ -199,9 +93,7 @@ def _description(raw: Any, root: ElementTree.Element) -> Description:
         derivatives=tuple(variables[v.name] for v in derivatives),
         inputs=tuple(v for v in own if v.causality == "input"),
         outputs=tuple(v for v in own if v.causality == "output"),
-        parameters=tuple(
-            v for v in own if v.causality == "parameter" and v.variability in {"fixed", "tunable"}
-        ),
+        parameters=tuple(v for v in own if v.causality == "parameter" and v.variability in {"fixed", "tunable"}),
         event_indicators=raw.numberOfEventIndicators,
         unsupported=unsupported,
         step=_number(experiment.stepSize) if experiment else None,
@@ -257,8 +149,8 @@ class Event:
 class Instance:
     """A running instance of an FMU; the same calls for both FMI versions and both kinds.
 
-    A fresh instance is initialized by `initialize`; a model-exchange instance is then in continuous-time mode, a
-    co-simulation instance ready to step. Vectors are float64 arrays in the order of the variables passed.
+    A fresh instance is initialized by `initialize`; then model exchange is in continuous-time mode, co-simulation
+    ready to step. Vectors are float64 arrays in the order of the variables passed.
 
     Parameters
     ----------
@@ -277,9 +169,7 @@ class Instance:
     def __init__(self, description: Description, folder: Path, kind: str):
         fmpy = _fmpy()
         if kind not in description.kinds:
-            raise FmuError(
-                f"{description.name} offers {', '.join(description.kinds) or 'nothing'}, not {kind}"
-            )
+            raise FmuError(f"{description.name} offers {', '.join(description.kinds) or 'nothing'}, not {kind}")
         self.description, self.kind = description, kind
         self.interface = description.kinds[kind]
         self.messages: deque[str] = deque(maxlen=5)
@@ -297,8 +187,8 @@ class Instance:
             )
         except Exception as error:
             raise FmuError(
-                f"the binary of {description.name} ({self.interface.identifier}) cannot be loaded: {error}. The FMU "
-                f"needs a binary for this platform ({fmpy.platform_tuple})"
+                f"the binary of {description.name} ({self.interface.identifier}) cannot be loaded: {error}. "
+                f"The FMU needs a binary for this platform ({fmpy.platform_tuple})"
             ) from error
         finally:
             os.chdir(here)  # fmpy steps into the FMU's folder and stays there when loading fails
@@ -309,25 +199,19 @@ class Instance:
         self._derivatives, self._indicators = (ctypes.c_double * self._nx)(), (ctypes.c_double * self._nz)()
 
     def _instantiate(self, fmpy: Any) -> None:
-        messages = self.messages
         options: dict[str, Any]
         if self._version == 2:
-            fmi2 = fmpy.fmi2
-            callbacks = fmi2.fmi2CallbackFunctions()
-            callbacks.logger = fmi2.fmi2CallbackLoggerTYPE(partial(_listen, messages))
-            callbacks.allocateMemory = fmi2.defaultCallbacks.allocateMemory
-            callbacks.freeMemory = fmi2.defaultCallbacks.freeMemory
-            # fmpy's addLoggerProxy would fill in the message's arguments, but keeps one logger for the whole process
-            options = {"callbacks": callbacks}
+            options = {}
+            options["callbacks"], self._fmu.listener = _fmi2_callbacks(fmpy.fmi2, self.messages)
         else:
-            options = {"logMessage": partial(_listen, messages)}
+            options = {"logMessage": partial(_listen3, self.messages)}
         try:
             self._fmu.instantiate(**options)
         except Exception as error:
             self._fmu.freeLibrary()
             raise FmuError(
-                f"{self.description.name} cannot be instantiated for {self.kind}{self._told()}. Its binary and its "
-                "modelDescription.xml may not belong together: export it again"
+                f"{self.description.name} cannot be instantiated for {self.kind}{self._told()}. Its binary and "
+                "its modelDescription.xml may not belong together: export it again"
             ) from error
 
     def _told(self) -> str:
@@ -340,9 +224,8 @@ class Instance:
             return getattr(self._fmu, name)(*arguments)
         except Exception as error:
             names = ", ".join(about)
-            raise FmuError(
-                f"{self.description.name}: {name}{f' of {names}' if names else ''} failed: {error}{self._told()}"
-            ) from error
+            what = f"{name} of {names}" if names else name
+            raise FmuError(f"{self.description.name}: {what} failed: {error}{self._told()}") from error
 
     def initialize(self, t: float, values: Mapping[str, float], tolerance: float | None = None) -> Event:
         """Initialize at time `t` with start values by name (inputs, parameters, settable states)."""
@@ -361,7 +244,7 @@ class Instance:
         return self._iterate()
 
     def event(self) -> Event:
-        """Enter event mode, iterate until nothing changes, return to continuous-time mode (model exchange)."""
+        """Enter event mode, iterate until nothing changes, and leave it again (model exchange)."""
         self._call("enterEventMode")
         return self._iterate()
 
@@ -396,9 +279,7 @@ class Instance:
             if self._version == 2:
                 self._call("fmi2SetReal", self._fmu.component, references, count, numbers, about=names)
             else:
-                self._call(
-                    "fmi3SetFloat64", self._fmu.component, references, count, numbers, count, about=names
-                )
+                self._call("fmi3SetFloat64", self._fmu.component, references, count, numbers, count, about=names)
 
     def get(self, variables: Sequence[Variable]) -> Array:
         """Return real variables."""
@@ -410,9 +291,7 @@ class Instance:
             if self._version == 2:
                 self._call("fmi2GetReal", self._fmu.component, references, count, numbers, about=names)
             else:
-                self._call(
-                    "fmi3GetFloat64", self._fmu.component, references, count, numbers, count, about=names
-                )
+                self._call("fmi3GetFloat64", self._fmu.component, references, count, numbers, count, about=names)
         return np.array(numbers[:], dtype=np.float64)
 
     def set_time(self, t: float) -> None:
@@ -454,9 +333,7 @@ class Instance:
     def do_step(self, t: float, length: float) -> None:
         """Advance a co-simulation from `t` by `length` seconds."""
         answer = self._call("doStep", t, length)
-        if answer is not None and (
-            answer[1] or abs(answer[3] - t - length) > 1e-9 * max(1.0, abs(t), length)
-        ):
+        if answer is not None and (answer[1] or abs(answer[3] - t - length) > 1e-9 * max(1.0, abs(t), length)):
             raise FmuError(
                 f"{self.description.name}: the step from {t} by {length} s ended at {answer[3]}"
                 f"{', asking to end the simulation' if answer[1] else ''}{self._told()}"
@@ -509,9 +386,35 @@ def _release(fmu: Any, saved: dict[int, Any]) -> None:
         log.debug("freeing an FMU failed", exc_info=True)
 
 
-def _listen(messages: deque[str], *arguments: Any) -> None:
-    # FMI 2: environment, instance name, status, category, message; FMI 3: environment, status, category, message
-    status, text = arguments[-3], (arguments[-1] or b"").decode("utf-8", "replace").strip()
-    log.debug("FMU message (status %s): %s", status, text)
-    if status not in (0, None):
-        messages.append(text)
+def _listen(messages: deque[str], status: int, text: bytes | None) -> None:
+    message = (text or b"").decode("utf-8", "replace").strip()
+    log.debug("FMU message (status %s): %s", status, message)
+    if status != 0:
+        messages.append(message)
+
+
+def _listen3(messages: deque[str], environment: Any, status: int, category: bytes, text: bytes | None) -> None:
+    _listen(messages, status, text)
+
+
+def _fmi2_callbacks(fmi2: Any, messages: deque[str]) -> tuple[Any, Any]:
+    """Return fmpy's callback structure and what must be kept alive with it.
+
+    A message is a printf format with arguments, which a Python callback cannot walk through. fmpy's addLoggerProxy
+    does, but keeps one logger for the whole process. Most FMUs pass "%s" and one text; the calling conventions
+    (but Apple's on ARM) hand that over like an ordinary sixth argument.
+    """
+    apple = sys.platform == "darwin" and platform.machine() == "arm64"
+
+    def listen(environment: Any, name: bytes, status: int, category: bytes, text: bytes, extra: int | None) -> None:
+        if text == b"%s" and extra is not None and not apple:
+            text = ctypes.string_at(extra)
+        _listen(messages, status, text)
+
+    pointer, text = ctypes.c_void_p, ctypes.c_char_p
+    listener = ctypes.CFUNCTYPE(None, pointer, text, ctypes.c_int, text, text, pointer)(listen)
+    callbacks = fmi2.fmi2CallbackFunctions()
+    callbacks.logger = ctypes.cast(listener, fmi2.fmi2CallbackLoggerTYPE)
+    callbacks.allocateMemory = fmi2.defaultCallbacks.allocateMemory
+    callbacks.freeMemory = fmi2.defaultCallbacks.freeMemory
+    return callbacks, listener

@@ -1,4 +1,4 @@
-"""Whether CasADi says the same as the FMU itself: values against fmpy, Jacobians against finite differences."""
+"""Whether CasADi says what the FMU says: values against fmpy, Jacobians against finite differences."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import casadi as ca
 import numpy as np
 
 from ctmhe.errors import FmuError
-from ctmhe.models._fmi import MODEL_EXCHANGE, Description, Instance, Variable
+from ctmhe.models._fmi import Instance
+from ctmhe.models._fmu_description import MODEL_EXCHANGE, Description, Variable
 from ctmhe.models._fmu_functions import FmuFunctions
 from ctmhe.types import Array
 
@@ -36,7 +37,7 @@ class Reference:
         self._about, self._folder, self._values = description, folder, dict(values)
 
     def start(self, *groups: Sequence[Variable]) -> tuple[float, list[Array]]:
-        """Return the time of the first time event (infinite when there is none) and the start values of `groups`."""
+        """Return the time of the first time event (infinite: none) and the start values of `groups`."""
         instance = Instance(self._about, self._folder, MODEL_EXCHANGE)
         try:
             event = instance.initialize(0.0, self._initial({}))
@@ -108,9 +109,7 @@ def check(description: Description, reference: Reference, functions: FmuFunction
     }
     usable = []
     for number, point in enumerate(_points(description, choice)):
-        dynamics, output = (
-            functions.create()
-        )  # an FMU that failed once fails for ever: every point has its own
+        dynamics, output = functions.create()  # an FMU that failed once fails for ever: every point has its own
         try:
             truth = reference.evaluate(
                 point["t"],
@@ -123,7 +122,8 @@ def check(description: Description, reference: Reference, functions: FmuFunction
         except (FmuError, RuntimeError) as error:
             if number == 0:
                 raise FmuError(
-                    f"{description.name} cannot be evaluated at its start values: {error}. Give others with start={{...}}"
+                    f"{description.name} cannot be evaluated at its start values: {error}. Give others with "
+                    "start={...}"
                 ) from error
             continue
         for label, own, ours in zip(rows, truth, found, strict=True):
@@ -138,7 +138,7 @@ def check(description: Description, reference: Reference, functions: FmuFunction
         else:
             usable.append(point)
             for label, function in zip(rows, (dynamics, output), strict=True):
-                _same_slopes(description, function, point, rows[label], columns, scales)
+                _same_slopes(description, function, point, names=rows[label], columns=columns, scales=scales)
     _same_when_mapped(description, functions.create()[0], usable, rows["dynamics"])
 
 
@@ -182,9 +182,10 @@ def _same_values(description: Description, names: Sequence[str], own: Array, our
     if wrong.any():
         i = int(np.flatnonzero(wrong)[0])
         raise FmuError(
-            f"{description.name}: CasADi evaluates {names[i]!r} as {ours[i]:.10g}, the FMU itself as {own[i]:.10g}, so it "
-            "cannot be used in an estimator. Its values may be stale after a set, or a parameter may only be set "
-            "before initialization: leave that parameter out, or export the FMU with a newer tool"
+            f"{description.name}: CasADi evaluates {names[i]!r} as {ours[i]:.10g}, the FMU itself as "
+            f"{own[i]:.10g}, so it cannot be used in an estimator. Its values may be stale after a set, or a "
+            "parameter may only be set before initialization: leave that parameter out, or export the FMU with a "
+            "newer tool"
         )
 
 
@@ -192,39 +193,36 @@ def _same_slopes(
     description: Description,
     function: ca.Function,
     point: Mapping[str, Any],
+    *,
     names: Sequence[str],
     columns: Mapping[str, Sequence[str]],
     scales: Mapping[str, Array],
 ) -> None:
     blocks = _blocks(function, point)
     here = _vector(function, point)
+    wrong: list[tuple[str, str, float, float, str]] = []
     for key, labels in columns.items():
         for j, label in enumerate(labels):
-            step = REACH * max(abs(point[key][j]), scales[key][j])
+            size = max(abs(point[key][j]), scales[key][j])
+            step = REACH * size
             shifted = [_vector(function, _moved(point, key, j, sign * step)) for sign in (1.0, -1.0)]
             sides = np.array([(shifted[0] - here) / step, (here - shifted[1]) / step])
             slope = blocks[key][:, j]
             # at a kink any slope between the two sides is right
             off = np.maximum(slope - sides.max(axis=0), sides.min(axis=0) - slope)
-            size = np.maximum(
-                np.abs(here) / max(abs(point[key][j]), scales[key][j]), np.abs(sides).max(axis=0)
-            )
-            wrong = ~(off <= SLOPE_TOLERANCE * size + 1e-12) & np.isfinite(sides).all(axis=0)
-            if wrong.any():
-                i = int(np.flatnonzero(wrong)[0])
-                raise FmuError(
-                    f"{description.name}: its derivative of {names[i]!r} with respect to {label!r} is {slope[i]:.6g}, but "
-                    f"finite differences give {sides[:, i].mean():.6g}; an estimator would go wrong. Most likely "
-                    f"{label!r} is missing from the `dependencies` of {names[i]!r} in modelDescription.xml"
-                    + (
-                        f": leave it out of parameters= (the values are still used), {_EXPORT}"
-                        if key == "p"
-                        else f": {_EXPORT}"
-                    )
-                )
-
-
-_EXPORT = "or export the FMU again with correct dependencies"
+            allowed = SLOPE_TOLERANCE * np.maximum(np.abs(here) / size, np.abs(sides).max(axis=0)) + 1e-12
+            for i in np.flatnonzero(~(off <= allowed) & np.isfinite(sides).all(axis=0)):
+                wrong.append((names[int(i)], label, slope[i], sides[:, i].mean(), key))
+    if not wrong:
+        return
+    # a missing dependency also spoils entries that are listed: first blame one that is zero and should not be
+    row, label, slope, expected, key = min(wrong, key=lambda entry: entry[2] != 0.0)
+    remedy = f"leave {label!r} out of parameters= (its value is still used), or " if key == "p" else ""
+    raise FmuError(
+        f"{description.name}: its derivative of {row!r} with respect to {label!r} is {slope:.6g}, but finite "
+        f"differences give {expected:.6g}; an estimator would go wrong. Most likely {label!r} is missing from the "
+        f"`dependencies` of {row!r} in modelDescription.xml: {remedy}export the FMU again with correct dependencies"
+    )
 
 
 def _moved(point: Mapping[str, Any], key: str, j: int, step: float) -> dict[str, Any]:
@@ -242,23 +240,19 @@ def _same_when_mapped(
     mapped = [ca.MX.sym(key, size, 3) for key, size in zip("txuwp", sizes, strict=True)]
     chain = mapped[1] + 0.01 * function.map(3)(*mapped)
     derivative = ca.Function("J", mapped, [ca.jacobian(ca.vec(chain), ca.vec(mapped[i])) for i in (1, 4)])
-    columns = [
-        np.column_stack(column) for column in zip(*(_arguments(function, s) for s in stages), strict=True)
-    ]
+    columns = [np.column_stack(column) for column in zip(*(_arguments(function, s) for s in stages), strict=True)]
     together = [np.asarray(ca.DM(value)) for value in derivative.call(columns)]
     nx = sizes[1]
     for k, stage in enumerate(stages):
         blocks = _blocks(function, stage)
         for value, key, width in ((together[0], "x", nx), (together[1], "p", sizes[4])):
             expected = np.zeros((nx, 3 * width))
-            expected[:, k * width : (k + 1) * width] = 0.01 * blocks[key] + (
-                np.eye(nx) if key == "x" else 0.0
-            )
+            expected[:, k * width : (k + 1) * width] = 0.01 * blocks[key] + (np.eye(nx) if key == "x" else 0.0)
             error = np.abs(value[k * nx : (k + 1) * nx] - expected)
             wrong = ~(error <= 1e-9 * (1.0 + np.abs(expected)))
             if wrong.any():
                 name = names[int(np.argwhere(wrong)[0, 0])]
                 raise FmuError(
-                    f"{description.name}: CasADi's derivative of {name!r} changes when stages are evaluated together, so "
-                    "an estimator would go wrong; this is a defect of this CasADi version: use another one"
+                    f"{description.name}: CasADi's derivative of {name!r} changes when stages are evaluated "
+                    "together, so an estimator would go wrong; this is a defect of this CasADi version: use another"
                 )

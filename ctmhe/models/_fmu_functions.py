@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +10,12 @@ import casadi as ca
 import numpy as np
 
 from ctmhe.errors import FmuError
-from ctmhe.models._fmi import Description, Variable
+from ctmhe.models._fmu_description import MODEL_EXCHANGE, Description, Variable
 from ctmhe.models.continuous import ARGUMENTS
 from ctmhe.types import Array
 
-# CasADi's own directional derivatives of FMUs are silently wrong inside mapped functions (a zero seed returns the
-# previous result). Both modes are off, and every derivative is taken from one Jacobian.
+# CasADi's own directional derivatives of FMUs are silently wrong inside mapped functions (a zero seed returns
+# the previous result). Both modes are off, and every derivative is taken from one Jacobian.
 NO_AD = {"enable_forward": False, "enable_reverse": False}
 # An FMU that CasADi exported may carry a symbolic copy of the model: evaluate the binary, not the copy.
 BINARY_ONLY = {"enable_ls_serialization": False}
@@ -67,9 +67,7 @@ class FmuFunctions:
         self._builder = builder
         states = [state.name for state in description.states]
         self._rows = [
-            self._declared.index(v.name)
-            if v.name in self._declared
-            else len(self._declared) + states.index(v.name)
+            self._declared.index(v.name) if v.name in self._declared else len(self._declared) + states.index(v.name)
             for v in outputs
         ]
 
@@ -85,7 +83,7 @@ class FmuFunctions:
         value = self._builder.create(f"{name}_fmu", inner, [what], NO_AD)
         columns = [f"jac_{what}_{key}" for key in "xup"]
         options: dict[str, Any] = dict(NO_AD)
-        if not self._about.kinds["ModelExchange"].directional_derivatives:
+        if not self._about.kinds[MODEL_EXCHANGE].directional_derivatives:
             options["fd_method"] = "central"
         jacobian = self._builder.create(f"jac_{name}_fmu", inner, columns, options)
         timed = self._builder.create("timed", inner, [f"jac_{what}_t"], NO_AD).nnz_out(0) > 0
@@ -103,8 +101,8 @@ class FmuFunctions:
         zero = {key: ca.MX(ca.DM(nx, sizes[key])) for key in "xup"} | {"x": ca.MX(ca.DM.eye(nx))}
         blocks = {key: self._pick(by[key], zero[key], what) for key in "xup"}
         blocks["w"] = ca.MX(ca.sparsify(ca.DM(spread)))
-        # The derivative in time is never asked of the FMU (generated code has been seen to crash on it); where the
-        # FMU says that time matters, it is a central difference.
+        # The derivative in time is never asked of the FMU (generated code has been seen to crash on it); where
+        # the FMU says that time matters, it is a central difference.
         reach = np.cbrt(np.finfo(float).eps) * ca.fmax(1, ca.fabs(t))
         slope = (evaluate(t + reach) - evaluate(t - reach)) / (2 * reach) if timed else ca.MX(rows, 1)
         blocks["t"] = slope
@@ -145,11 +143,5 @@ def _explained(description: Description, error: Exception) -> FmuError:
     text = " ".join(str(error).split())
     hint = ""
     if "dependencies" in text and "not implemented" in text:
-        hint = ": its modelDescription.xml lists no `dependencies` for outputs and derivatives; export it with them"
+        hint = ": its modelDescription.xml lists no `dependencies` of outputs and derivatives; export it with them"
     return FmuError(f"{description.name} cannot be evaluated by CasADi{hint} ({text[-400:]})")
-
-
-def first(names: Iterable[str]) -> str:
-    """Return at most five names as text."""
-    listed = list(names)
-    return ", ".join(listed[:5]) + (f" and {len(listed) - 5} more" if len(listed) > 5 else "")

@@ -39,9 +39,7 @@ class Model(Protocol):
     bounds: Bounds
 
 
-def build_function(
-    name: str, function: Callable[..., Any], sizes: Mapping[str, int], rows: int
-) -> ca.Function:
+def build_function(name: str, function: Callable[..., Any], sizes: Mapping[str, int], rows: int) -> ca.Function:
     """Trace `function(t, x, u, w, p)` once and return it as a dense CasADi function with `rows` outputs."""
     symbols = [ca.SX.sym(key, sizes.get(key, 1)) for key in ARGUMENTS]
     try:
@@ -54,9 +52,7 @@ def build_function(
     try:
         column = ca.SX(value if isinstance(value, (ca.SX, ca.DM, float, int)) else ca.vertcat(*value))
     except Exception as error:
-        raise ModelError(
-            f"{name} must return a vector or a sequence of scalars, got {type(value).__name__}"
-        ) from error
+        raise ModelError(f"{name} must return a vector or a sequence of scalars, got {type(value).__name__}") from error
     if column.numel() != rows or 1 not in column.shape:
         what = f"{column.numel()} values" if 1 in column.shape else f"a matrix of shape {column.shape}"
         raise ModelError(f"{name} returned {what}, expected {rows} value{'s' * (rows != 1)}")
@@ -177,9 +173,7 @@ def check_differentiable(model: Model) -> None:
             values = function.call(arguments)
             values = values + function.jacobian().call([*arguments, *values])
         except Exception as error:
-            raise ModelError(
-                f"{label} of model {model.name!r} cannot be evaluated at x = {x}: {error}"
-            ) from error
+            raise ModelError(f"{label} of model {model.name!r} cannot be evaluated at x = {x}: {error}") from error
         if not all(np.isfinite(np.asarray(ca.DM(value))).all() for value in values):
             raise ModelError(
                 f"{label} of model {model.name!r} or its Jacobian is not finite at the trial point x = {x}; "
@@ -221,11 +215,7 @@ def box_arrays(signals: Signals, box: Any, what: str) -> tuple[Array, Array]:
             ) from None
     for i, name in enumerate(signals.names):
         if not lower[i] <= upper[i]:
-            raise InputError(
-                f"{what}: {signals.kind} {name!r} has lower {lower[i]} above upper {upper[i]} (or NaN)"
-            )
+            raise InputError(f"{what}: {signals.kind} {name!r} has lower {lower[i]} above upper {upper[i]} (or NaN)")
         if lower[i] == np.inf or upper[i] == -np.inf:
-            raise InputError(
-                f"{what}: {signals.kind} {name!r} has no finite value between {lower[i]} and {upper[i]}"
-            )
+            raise InputError(f"{what}: {signals.kind} {name!r} has no finite value between {lower[i]} and {upper[i]}")
     return lower, upper

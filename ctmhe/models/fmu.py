@@ -10,25 +10,19 @@ import numpy as np
 
 from ctmhe.errors import FmuError, InputError
 from ctmhe.models._archive import Unpacked
-from ctmhe.models._fmi import (
-    CO_SIMULATION,
-    MODEL_EXCHANGE,
-    Description,
-    Variable,
-    read_description,
-    signals_of,
-)
+from ctmhe.models._fmi import read_description
 from ctmhe.models._fmu_check import Choice, Reference, check
+from ctmhe.models._fmu_description import CO_SIMULATION, MODEL_EXCHANGE, Description, Variable, signals_of
 from ctmhe.models._fmu_functions import FmuFunctions
 from ctmhe.models.signals import Signals
 from ctmhe.types import Bounds, frozen
 
 
 class FmuModel:
-    """dx/dt = f(t, x, u, p) + w, y = h(t, x, u, p) (+ v) of a model-exchange FMU: thesis (3.7), with parameters.
+    """dx/dt = f(t, x, u, p) + w, y = h(t, x, u, p) (+ v) of a model-exchange FMU: thesis (3.7), with p.
 
-    The archive is unpacked into a private temporary folder that lives as long as the model, or until `close`. Pickles
-    as its configuration: path, hash of the file's contents, arguments.
+    The archive is unpacked into a private temporary folder that lives as long as the model, or until `close`.
+    Pickles as its configuration: path, hash of the file's contents, arguments.
 
     Parameters
     ----------
@@ -66,8 +60,8 @@ class FmuModel:
     Raises
     ------
     FmuError
-        If the FMU cannot be unpacked, read, loaded or evaluated, has no model exchange or no states, has events, or if
-        CasADi's values or Jacobians differ from the FMU's own; the message names the variable.
+        If the FMU cannot be unpacked, read, loaded or evaluated, has no model exchange or no states, has events,
+        or if CasADi's values or Jacobians differ from the FMU's own; the message names the variable.
     InputError
         If a name is unknown; the message suggests the nearest.
     """
@@ -143,15 +137,14 @@ class FmuModel:
         known = {v.name: v for v in about.outputs + (about.states if wanted is not None else ())}
         outputs = about.select("output", wanted, tuple(known.values()))
         if not outputs:
-            raise FmuError(
-                f"{about.name} has no real output; name measured states: outputs=[{about.states[0].name!r}]"
-            )
+            raise FmuError(f"{about.name} has no real output; name measured states: outputs=[{about.states[0].name!r}]")
         parameters = about.select("parameter", self._arguments["parameters"], about.parameters)
         for parameter in parameters:
             if parameter.variability != "tunable":
                 raise FmuError(
-                    f"{about.name}: parameter {parameter.name!r} is {parameter.variability}, only tunable parameters can "
-                    f"be estimated; set it with start={{{parameter.name!r}: ...}}, or export the FMU with it tunable"
+                    f"{about.name}: parameter {parameter.name!r} is {parameter.variability}, only tunable "
+                    f"parameters can be estimated; set it with start={{{parameter.name!r}: ...}}, or export the "
+                    "FMU with it tunable"
                 )
         return about.select("input", self._arguments["inputs"], about.inputs), outputs, parameters
 
@@ -160,9 +153,7 @@ class FmuModel:
         for key in "xuwpy":
             group: Signals = getattr(self, key)
             if len(group):
-                labels = (
-                    f"{n} [{unit}]" if unit else n for n, unit in zip(group.names, group.units, strict=True)
-                )
+                labels = (f"{n} [{unit}]" if unit else n for n, unit in zip(group.names, group.units, strict=True))
                 rows.append(f"  {key}: {', '.join(labels)}")
         return "\n".join(rows)
 
@@ -187,13 +178,11 @@ def check_suitable(about: Description) -> None:
     if MODEL_EXCHANGE not in about.kinds:
         has = f"{CO_SIMULATION} only" if CO_SIMULATION in about.kinds else "neither kind"
         raise FmuError(
-            f"{about.name} offers {has}; an estimator needs model exchange: export it as such, or use it as the plant "
-            "(FmuPlant)"
+            f"{about.name} offers {has}; an estimator needs model exchange: export it as such, or use it as the "
+            "plant (FmuPlant)"
         )
     for name, what in about.unsupported.items():
-        raise FmuError(
-            f"{about.name}: variable {name!r} is {what}, which is not supported; export it with scalars"
-        )
+        raise FmuError(f"{about.name}: variable {name!r} is {what}, which is not supported; export it with scalars")
     if not about.states:
         raise FmuError(f"{about.name} has no continuous states, so there is nothing to estimate")
 
@@ -202,14 +191,11 @@ def check_events(about: Description, next_time: float, *, allowed: bool) -> None
     """Raise `FmuError` when an FMU has events and freezing them is not allowed."""
     if allowed or (about.event_indicators == 0 and not np.isfinite(next_time)):
         return
-    what = (
-        f"{about.event_indicators} event indicators"
-        if about.event_indicators
-        else f"a time event at t = {next_time}"
-    )
+    count = about.event_indicators
+    what = f"{count} event indicator{'s' * (count > 1)}" if count else f"a time event at t = {next_time}"
     raise FmuError(
-        f"{about.name} has {what}; inside an estimator its discrete variables would stay frozen. If that is acceptable "
-        "in the range of interest, say allow_frozen_events=True; as the plant (FmuPlant) events are handled"
+        f"{about.name} has {what}; inside an estimator its discrete variables would stay frozen. If that is "
+        "acceptable in the range of interest, say allow_frozen_events=True; as the plant (FmuPlant) events are handled"
     )
 
 
@@ -233,6 +219,4 @@ def disturbance_signals(disturbed: Sequence[Variable], noisy: Sequence[Variable]
 
 def incidence(rows: Sequence[Variable], columns: Sequence[Variable]) -> np.ndarray:
     """Return the matrix (rows, columns) with 1 where both are the same variable."""
-    return np.array([[float(row.name == column.name) for column in columns] for row in rows]).reshape(
-        len(rows), -1
-    )
+    return np.array([[float(row.name == column.name) for column in columns] for row in rows]).reshape(len(rows), -1)

@@ -61,8 +61,8 @@ class Signals:
         try:
             return self.names.index(name)
         except ValueError:
-            near = get_close_matches(name, self.names, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
+            near = get_close_matches(str(name), self.names, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else "."
             raise InputError(f"unknown {self.kind} {name!r}{hint} Known: {', '.join(self.names) or 'none'}") from None
 
     def vector(self, values: Any, what: str, *, missing: float | None = None, allow_nan: bool = False) -> Array:
@@ -76,7 +76,11 @@ class Signals:
             vector = np.full(n, np.nan if missing is None else missing)
             given = set()
             for name, value in values.items():
-                vector[self.index(name)] = value
+                i = self.index(name)
+                try:
+                    vector[i] = float(value)
+                except (TypeError, ValueError):
+                    raise InputError(f"{what}: {self.kind} {name!r} must be a number, got {value!r}") from None
                 given.add(name)
             absent = [name for name in self.names if name not in given]
             if missing is None and absent:

@@ -14,6 +14,7 @@ from ctmhe.types import Array
 
 ARMIJO = 1e-4
 DAMPING_START, DAMPING_LIMIT = 1e-8, 1e8
+SLOW = 0.05  # predicted decreases that shrink by less than this factor call for second derivatives
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +33,12 @@ class _Iterate:
 class GaussNewton:
     """The default solver.
 
-    Each iteration linearises all slots, solves the quadratic program with its bounds, and takes a step that decreases the
-    exact penalty function J/2 + rho (|dynamics defect|_1 + |output bound excess|_1), backtracking where needed; when no step
-    does, a Levenberg term is added and raised. It stops when the decrease that the model predicts falls below `tolerance`
-    relative to the cost and the dynamics hold.
+    Each iteration linearises all slots, solves the quadratic program with its bounds, and takes a step that decreases
+    the exact penalty function J/2 + rho (|dynamics defect|_1 + |output bound excess|_1), backtracking where needed;
+    when no step does, a Levenberg term is added and raised. It stops when the decrease that the model predicts falls below
+    `tolerance` relative to the cost and the dynamics hold. Gauss-Newton converges linearly where residuals are large
+    and the model is curved; when that is slow, the second derivatives of the stage (symbolic models) are added and
+    the last iterations are Newton's.
 
     Parameters
     ----------
@@ -61,7 +64,8 @@ class GaussNewton:
         floor = 1e-14 * self._data_scale(window)
         factorizations, damping, rho = 0, 0.0, 0.0
         step: Step | None = None
-        optimality = float("nan")
+        optimality = last_decrease = float("nan")
+        newton = False
         guess = clip_to_bounds(window, guess)
         active = ActiveSet(guess.x_active, guess.w_active, guess.y_active, guess.p_active[: kkt.np])
         active = _admissible(window, active, bool(kkt.ny))
@@ -73,11 +77,15 @@ class GaussNewton:
             return self._failed(window, guess, "the model is not finite at the guess")
         message, success = f"no convergence in {self.max_iterations} iterations", False
         iteration = 0
-        for iteration in range(1, self.max_iterations + 1):
-            qp = self._quadratic_program(window, current, kkt)
+        while iteration < self.max_iterations:
+            iteration += 1
+            qp = self._quadratic_program(window, current, kkt, step if newton else None)
             try:
                 step = kkt.solve(qp, active, damping=damping)
             except Singular as error:
+                if newton:
+                    newton, last_decrease = False, float("nan")
+                    continue
                 damping = max(10 * damping, DAMPING_START * _typical_curvature(qp))
                 if damping > DAMPING_LIMIT * _typical_curvature(qp):
                     message = str(error)
@@ -91,6 +99,9 @@ class GaussNewton:
                 rho, 1.5 * float(np.abs(step.dynamics).max(initial=0.0)), 1.5 * float(np.abs(step.zy).max(initial=0.0))
             )
             trial, alpha = self._line_search(window, current, step, rho, predicted)
+            if trial is None and newton:
+                newton, last_decrease = False, float("nan")
+                continue
             if trial is None:
                 damping = max(10 * damping, DAMPING_START * _typical_curvature(qp))
                 if damping > DAMPING_LIMIT * _typical_curvature(qp):
@@ -98,6 +109,9 @@ class GaussNewton:
                     break
                 continue
             damping = 0.0 if damping < DAMPING_START * _typical_curvature(qp) else 0.1 * damping
+            slow = iteration > 4 and abs(predicted) > SLOW * abs(last_decrease)
+            newton = self.stage.symbolic and alpha == 1.0 and (newton or slow)
+            last_decrease = predicted
             current = trial
             scale = max(current.cost, floor)
             small = abs(predicted) <= self.tolerance * scale and alpha == 1.0
@@ -194,7 +208,20 @@ class GaussNewton:
         residual = max(float(np.abs(g).max(initial=0.0)) for g in (Hx, Hw, Hp))
         return -(slope + curvature / 2), residual / max(size, 1e-300)
 
-    def _quadratic_program(self, window: Window, current: _Iterate, kkt: KKT) -> QuadraticProgram:
+    def _curvature(self, window: Window, current: _Iterate, multipliers: Step) -> Array:
+        """Return the second-order terms of the Lagrangian per slot (N, n, n) in (x, w, p), unscaled."""
+        point, mesh, linear = current.point, window.mesh, current.linear
+        residual = (window.L_y @ (linear.y - window.y_data)[..., None])[..., 0]
+        lambda_y = (window.L_y.transpose(0, 1, 3, 2) @ residual[..., None])[..., 0]
+        if multipliers.zy.shape[1]:
+            lambda_y[:, -1] += multipliers.zy / window.y_scale
+        lambda_x = multipliers.dynamics / window.x_scale
+        arguments = (mesh.t[:-1], mesh.h, point.x[:-1], point.w, point.p, window.u0, window.u1)
+        return self.stage.curvature(*arguments, lambda_x, lambda_y.reshape(len(mesh), -1))
+
+    def _quadratic_program(
+        self, window: Window, current: _Iterate, kkt: KKT, multipliers: Step | None = None
+    ) -> QuadraticProgram:
         stage, point, linear = self.stage, current.point, current.linear
         n, nx, nw, npar = len(window.mesh), stage.nx, stage.nw, kkt.np
         scale = np.concatenate([window.x_scale, window.w_scale, window.p_scale[:npar]])
@@ -204,6 +231,9 @@ class GaussNewton:
         rooted = (window.L_y @ output_rows).reshape(n, stage.q * stage.ny, -1)
         residual = (window.L_y @ (linear.y - window.y_data)[..., None]).reshape(n, -1, 1)
         H = rooted.transpose(0, 2, 1) @ rooted
+        if multipliers is not None:
+            extra = self._curvature(window, current, multipliers)
+            H = H + extra[:, : nx + nw + npar, : nx + nw + npar] * scale[:, None] * scale
         g = (rooted.transpose(0, 2, 1) @ residual)[..., 0]
         root_w = window.L_w * window.w_scale
         Hww = H[:, nx : nx + nw, nx : nx + nw] + root_w.transpose(0, 2, 1) @ root_w
@@ -257,9 +287,9 @@ class GaussNewton:
     def covariance(self, window: Window, point: Guess) -> tuple[Array, int]:
         """Return the covariance of (x at the window's end, estimated p) and the number of determined directions.
 
-        The inverse of half the Gauss-Newton Hessian of J, reduced by the dynamics; active bounds are ignored. Found from the
-        KKT system with two small regularisations: directions whose variance grows in proportion are not determined, and
-        the variances of the signals in them are infinite.
+        The inverse of half the Gauss-Newton Hessian of J, reduced by the dynamics; active bounds are ignored. Found
+        from the KKT system with two small regularisations: directions whose variance grows in proportion are not
+        determined, and the variances of the signals in them are infinite.
         """
         stage = self.stage
         kkt = KKT(stage.nx, stage.nw, 0, stage.np * window.p_estimated)
@@ -302,13 +332,12 @@ def _typical_curvature(qp: QuadraticProgram) -> float:
 def _without_copies(window: Window, *bounds: Array) -> tuple[Array, ...]:
     """Drop bounds on copies: w of a slot that shares it with the one before, x behind a slot of no length."""
     shared, still = window.mesh.shared[:-1], window.mesh.h == 0.0
-    result = []
-    for i, bound in enumerate(bounds):
-        copied = np.concatenate([[False], still if i < 2 else shared])
-        if copied.any():
-            bound = np.where(copied[:, None], -np.inf if i % 2 == 0 else np.inf, bound)
-        result.append(bound)
-    return tuple(result)
+    copies = [np.concatenate([[False], still]), np.concatenate([[False], shared])]
+    free = (-np.inf, np.inf)
+    return tuple(
+        np.where(copies[i // 2][:, None], free[i % 2], bound) if copies[i // 2].any() else bound
+        for i, bound in enumerate(bounds)
+    )
 
 
 def _admissible(window: Window, active: ActiveSet, output_bounded: bool) -> ActiveSet:

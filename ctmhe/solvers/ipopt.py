@@ -41,9 +41,10 @@ class _Program:
 class Ipopt:
     """The reference solver.
 
-    Its NLP has a capacity of slots that doubles when a window needs more (logged); spare slots have length zero, everything
-    on them is fixed and their equations are switched off. Cells that are split share their w through differences that are fixed to zero by bounds, so the structure never
-    changes. The Hessian is exact for models of scalar expressions, Gauss-Newton otherwise.
+    Its NLP has a capacity of slots that doubles when a window needs more (logged); spare slots have length zero,
+    everything on them is fixed and their equations are switched off. Cells that are split share their w through
+    differences that are fixed to zero by bounds, so the structure never changes. The Hessian is exact for models of
+    scalar expressions, Gauss-Newton otherwise.
 
     Parameters
     ----------

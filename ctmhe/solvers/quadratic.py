@@ -1,8 +1,8 @@
 """The structured quadratic program of one Gauss-Newton step: banded KKT system, active bounds by semismooth Newton.
 
-The unknowns of slot k are ordered [dx_k, dw_k, nu_k, lambda_k, mu_k]: states, disturbance, multipliers of output bounds, of
-the dynamics and of the sharing of w inside a cell. In this order the KKT matrix is banded, and LAPACK factorises it with
-partial pivoting in O(N). Constant parameters are a border, eliminated by a small Schur complement.
+The unknowns of slot k are ordered [dx_k, dw_k, nu_k, lambda_k, mu_k]: states, disturbance, multipliers of output
+bounds, of the dynamics and of the sharing of w inside a cell. In this order the KKT matrix is banded, and LAPACK
+factorises it with partial pivoting in O(N). Constant parameters are a border, eliminated by a small Schur complement.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg.lapack import dgbtrf, dgbtrs
+from scipy.linalg.lapack import dgbtrf, dgbtrs  # pyright: ignore[reportAttributeAccessIssue]
 
 from ctmhe.types import Array
 
@@ -21,7 +21,8 @@ class QuadraticProgram:
 
     Shapes: N slots, `Hxx (N, nx, nx)`, `Hxw (N, nx, nw)`, `Hww (N, nw, nw)`, `Hxp (N, nx, np)`, `Hwp (N, nw, np)`,
     `Hpp (np, np)`, `gx (N+1, nx)`, `gw (N, nw)`, `gp (np,)`; dynamics A dx_k + B dw_k + E dp - dx_{k+1} = -c; outputs
-    C dx_k + D dw_k + F dp between y_lower and y_upper (all relative to the current point); `shared (N,)` ties dw_{k+1} = dw_k.
+    C dx_k + D dw_k + F dp between y_lower and y_upper (all relative to the current point); `shared (N,)` ties
+    dw_{k+1} = dw_k.
     """
 
     Hxx: Array
@@ -134,9 +135,9 @@ class KKT:
     def solve(self, qp: QuadraticProgram, active: ActiveSet, *, damping: float = 0.0, max_changes: int = 40) -> Step:
         """Return the minimiser, starting from a guess of the active set.
 
-        The primal-dual active set method (a semismooth Newton method): each pass solves the equality-constrained problem,
-        then drops held bounds whose multiplier has the wrong sign and holds violated ones. When a set comes back, only the
-        single worst change is made from then on.
+        The primal-dual active set method (a semismooth Newton method): each pass solves the equality-constrained
+        problem, then drops held bounds whose multiplier has the wrong sign and holds violated ones. When a set comes
+        back, only the single worst change is made from then on.
 
         Raises
         ------

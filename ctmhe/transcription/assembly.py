@@ -44,8 +44,8 @@ class Assembly:
     parts : int
         Integration steps a cell.
     hold : str or mapping output -> str
-        How each output's samples enter: `zero`, `linear` (the whole signal, weighted by R) or `point` (each sample at its
-        time, weighted by R_point).
+        How each output's samples enter: `zero`, `linear` (the whole signal, weighted by R) or `point` (each sample at
+        its time, weighted by R_point).
     hold_limit : float
         Seconds for which a held sample counts when no newer one has come.
     input_hold : {"zero", "linear"}
@@ -132,7 +132,7 @@ class Assembly:
     ) -> Window:
         """Return the problem over [start, end] as arrays."""
         model, stage, mesh = self.model, self.stage, self.mesh(start, end, records, growing=growing)
-        n, ny = len(mesh), stage.ny
+        n = len(mesh)
         if len(model.u):
             u0, u1 = held_inputs(records.u_times, records.u, mesh.t, mesh.tolerance, self.input_linear)
         else:
@@ -209,7 +209,7 @@ class Assembly:
             weight = np.sqrt(mesh.h * share * np.exp(-self.rate * (end - times[:, i])))
             L_y[:, i] = weight[:, None, None] * self.R.roots(times[:, i], known[:, i])
         sample, edge = point_rows(records.y_times, mesh.t, mesh.tolerance)
-        if n > 1 and mesh.h[0] == 0.0:
+        if mesh.h[0] == 0.0:  # the samples at the window's start belong to the end of the slot of no length
             edge = np.maximum(edge, 1)
         for i, e in zip(sample, edge, strict=True):
             row = np.isfinite(records.y[i])
@@ -280,7 +280,7 @@ def prior_names(model: Model, cost: DiscountedCost) -> tuple[tuple[str, ...], bo
     both = (*model.x.names, *model.p.names)
     if not len(model.p):
         return model.x.names, False
-    P = cost.P(0.0, 0.0) if callable(cost.P) else cost.P
+    P: Any = cost.P(0.0, 0.0) if callable(cost.P) else cost.P
     if isinstance(P, dict):
         estimated = any(name in model.p.names for name in P)
     else:

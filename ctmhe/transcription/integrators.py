@@ -141,7 +141,8 @@ class CVODES:
 class StepMap:
     """The model's own step map: what a `DiscreteModel` uses. The output belongs to the slot's start.
 
-    A slot of length zero leaves the state where it is: the filtering form ends with one, to count the newest measurement.
+    A slot of length zero leaves the state where it is: the filtering form ends with one, to count the newest
+    measurement.
     """
 
     nodes = np.empty(0)

@@ -118,7 +118,7 @@ def prior_deviation(window: Window, guess: Guess) -> Array:
 
 
 def rollout(stage: StageFunction, window: Window, x: Array, p: Array, w: Array | None = None) -> Guess:
-    """Integrate from `x` over the window, with disturbance `w` (N, nw) or none; dynamically feasible by construction."""
+    """Integrate from `x` over the window, with disturbance `w` (N, nw) or none: feasible by construction."""
     mesh = window.mesh
     n = len(mesh)
     w = np.zeros((n, stage.nw)) if w is None else w

@@ -66,7 +66,13 @@ class StageFunction:
         self.value = ca.Function("stage", symbols, [x_next, y])
         self.derivative = ca.Function("stage_jacobian", symbols, [x_next, y, jacobian])
         self.symbolic = symbolic
-        self.mapped = {size: (self.value.map(size), self.derivative.map(size)) for size in CHUNKS}
+        functions = [self.value, self.derivative]
+        if symbolic:  # second derivatives of dot(lambda_x, x_next) + dot(lambda_y, y)
+            duals = [kind.sym("lambda_x", self.nx), kind.sym("lambda_y", self.q * self.ny)]
+            lagrangian = ca.dot(duals[0], x_next) + ca.dot(duals[1], y)
+            hessian, _ = ca.hessian(lagrangian, ca.vertcat(*symbols[2:5]))
+            functions.append(ca.Function("stage_curvature", symbols + duals, [ca.densify(hessian)]))
+        self.mapped = [{size: function.map(size) for size in CHUNKS} for function in functions]
         self._local = local()
 
     def _scratch(self) -> _Scratch:
@@ -81,12 +87,19 @@ class StageFunction:
 
     def values(self, t: Array, h: Array, x: Array, w: Array, p: Array, u0: Array, u1: Array) -> tuple[Array, Array]:
         """Evaluate N slots: x_next (N, nx) and y (N, q, ny), without Jacobians."""
-        x_next, y, _ = self._scratch().many(False, t, h, x, w, p, u0, u1)
-        return x_next, y
+        x_next, y = self._scratch().many(0, t, h, x, w, p, u0, u1)
+        return x_next, y.reshape(len(t), self.q, self.ny)
 
     def linearize(self, t: Array, h: Array, x: Array, w: Array, p: Array, u0: Array, u1: Array) -> Linearization:
         """Evaluate N slots with Jacobians."""
-        return Linearization(*self._scratch().many(True, t, h, x, w, p, u0, u1))
+        x_next, y, jacobian = self._scratch().many(1, t, h, x, w, p, u0, u1)
+        return Linearization(x_next, y.reshape(len(t), self.q, self.ny), jacobian.transpose(0, 2, 1))
+
+    def curvature(
+        self, t: Array, h: Array, x: Array, w: Array, p: Array, u0: Array, u1: Array, lambda_x: Array, lambda_y: Array
+    ) -> Array:
+        """Return the Hessians (N, n, n) of lambda_x' x_next + lambda_y' vec(y) in (x, w, p); symbolic models only."""
+        return self._scratch().many(2, t, h, x, w, p, u0, u1, lambda_x, lambda_y)[0]
 
 
 class _Scratch:
@@ -94,52 +107,51 @@ class _Scratch:
 
     def __init__(self, stage: StageFunction):
         self.stage = stage
-        self.widths = (1, 1, stage.nx, stage.nw, stage.np, stage.nu, stage.nu)
-        self.values = [self._bind(function, size) for size, (function, _) in stage.mapped.items()]
-        self.derivatives = [self._bind(function, size) for size, (_, function) in stage.mapped.items()]
-
-    def _bind(self, function: ca.Function, size: int) -> _Bound:
-        stage = self.stage
-        rows = stage.nx + stage.q * stage.ny
-        inputs = [np.zeros((size, width)) for width in self.widths]
-        outputs = [np.zeros((size, stage.nx)), np.zeros((size, stage.q * stage.ny))]
-        if function.n_out() == 3:
-            outputs.append(np.zeros((size, stage.nx + stage.nw + stage.np, rows)))
-        buffer, trigger = function.buffer()
-        for i, array in enumerate(inputs):
-            if array.size:
-                buffer.set_arg(i, memoryview(array))
-        for i, array in enumerate(outputs):
-            buffer.set_res(i, memoryview(array))
-        return _Bound(size, inputs, outputs, trigger, buffer)
+        self.bound = [[_bind(function, size) for size, function in group.items()] for group in stage.mapped]
 
     def one(self, *values) -> tuple[Array, Array]:
-        bound = self.values[-1]
+        bound = self.bound[0][-1]
         for array, value in zip(bound.inputs, values, strict=True):
             array[0] = value
         bound.run()
         x_next, y = bound.outputs
         return x_next[0].copy(), y.reshape(self.stage.q, self.stage.ny).copy()
 
-    def many(self, jacobians: bool, *values: Array) -> tuple[Array, Array, Array]:
-        stage, n = self.stage, len(values[0])
-        rows, columns = stage.nx + stage.q * stage.ny, stage.nx + stage.nw + stage.np
-        x_next, y = np.empty((n, stage.nx)), np.empty((n, stage.q * stage.ny))
-        jacobian = np.empty((n if jacobians else 0, columns, rows))
-        t, h, x, w, p, u0, u1 = values
-        arrays = (t[:, None], h[:, None], x, w, np.broadcast_to(p, (n, stage.np)), u0, u1)
-        results = (x_next, y, jacobian)
+    def many(self, order: int, t: Array, h: Array, x: Array, w: Array, p: Array, *rest: Array) -> list[Array]:
+        """Evaluate n slots with the function of derivative `order`; results have n rows, columns before rows."""
+        n = len(t)
+        arrays = (t[:, None], h[:, None], x, w, np.broadcast_to(p, (n, self.stage.np)), *rest)
+        group = self.bound[order]
+        results = [np.empty((n, *output.shape[1:])) for output in group[0].outputs]
         start = 0
-        for bound in self.derivatives if jacobians else self.values:
+        for bound in group:
             while n - start >= bound.size:
                 stop = start + bound.size
                 for array, value in zip(bound.inputs, arrays, strict=True):
                     array[:] = value[start:stop]
                 bound.run()
-                for result, array in zip(results, bound.outputs, strict=False):
+                for result, array in zip(results, bound.outputs, strict=True):
                     result[start:stop] = array
                 start = stop
-        return x_next, y.reshape(n, stage.q, stage.ny), jacobian.transpose(0, 2, 1)
+        return results
+
+
+def _bind(function: ca.Function, size: int) -> _Bound:
+    """Return a function mapped `size` times together with memory for its arguments and results."""
+    inputs: list[Array] = [np.zeros((size, function.size1_in(i))) for i in range(function.n_in())]
+    outputs: list[Array] = []
+    for i in range(function.n_out()):
+        rows, columns = function.size1_out(i), function.size2_out(i) // size
+        outputs.append(
+            np.zeros((size, rows) if columns == 1 and i < 2 and function.n_out() > 1 else (size, columns, rows))
+        )
+    buffer, trigger = function.buffer()
+    for i, array in enumerate(inputs):
+        if array.size:
+            buffer.set_arg(i, memoryview(array))  # pyright: ignore
+    for i, array in enumerate(outputs):
+        buffer.set_res(i, memoryview(array))  # pyright: ignore
+    return _Bound(size, inputs, outputs, trigger, buffer)
 
 
 @dataclass(frozen=True, eq=False)

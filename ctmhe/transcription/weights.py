@@ -38,7 +38,7 @@ def weight_matrix(value: Any, names: tuple[str, ...], what: str) -> Array:
         array = np.diag(array)
     if array.shape != (n, n):
         raise InputError(
-            f"{what}: expected a scalar, {n} diagonal entries or a ({n}, {n}) matrix for {', '.join(names) or 'nothing'}; "
+            f"{what}: expected a scalar, {n} diagonal entries or a ({n}, {n}) matrix for {', '.join(names)}; "
             f"got shape {array.shape}"
         )
     if not np.isfinite(array).all():

@@ -67,9 +67,7 @@ def chua(*, noise: bool = True, parameters: str | Sequence[str] = ("p",)) -> Con
         p=constants.names,
         y=OUTPUTS,
         units={"w_x1": "1/s", "w_x2": "1/s", "w_x3": "1/s"},
-        nominal={"x1": 2.0, "x2": 0.3, "x3": 3.0, "voltage": 2.0}
-        | dict.fromkeys(names, 0.1)
-        | constants.nominal,
+        nominal={"x1": 2.0, "x2": 0.3, "x3": 3.0, "voltage": 2.0} | dict.fromkeys(names, 0.1) | constants.nominal,
         p_start=constants.start,
         bounds=Bounds(
             x={"x1": (-1.0, 3.0), "x2": (-1.0, 1.0), "x3": (-3.0, 3.0)},

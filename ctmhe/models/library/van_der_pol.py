@@ -12,9 +12,7 @@ from ctmhe.types import Bounds
 STATES, OUTPUTS = ("x1", "x2"), ("position",)
 
 
-def van_der_pol(
-    *, mu: float = 1.0, noise: bool = True, parameters: str | Sequence[str] = ()
-) -> ContinuousModel:
+def van_der_pol(*, mu: float = 1.0, noise: bool = True, parameters: str | Sequence[str] = ()) -> ContinuousModel:
     """Return an oscillator whose damping feeds small swings and brakes large ones.
 
     Position and velocity obey::

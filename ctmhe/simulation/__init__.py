@@ -1,0 +1,27 @@
+"""Plants, disturbances, channels, and the loop that runs them with a trigger and an estimator."""
+
+from ctmhe.simulation.channel import Channel, Delivery, Everything, Link, SingleSample, WholeSignal
+from ctmhe.simulation.loop import simulate
+from ctmhe.simulation.plants import MapPlant, OdePlant, Plant
+from ctmhe.simulation.replay import replay
+from ctmhe.simulation.run import Run
+from ctmhe.simulation.signals import Gaussian, Recorded, Uniform, Waveform
+
+__all__ = [
+    "Channel",
+    "Delivery",
+    "Everything",
+    "Gaussian",
+    "Link",
+    "MapPlant",
+    "OdePlant",
+    "Plant",
+    "Recorded",
+    "Run",
+    "SingleSample",
+    "Uniform",
+    "Waveform",
+    "WholeSignal",
+    "replay",
+    "simulate",
+]

@@ -1,0 +1,216 @@
+"""The result of a run: trajectories, samples, solves and errors, with names and units; saved to NetCDF."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from uuid import uuid4
+
+import numpy as np
+import xarray as xr
+
+from ctmhe.errors import InputError
+from ctmhe.types import Array
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FORMAT = "ctmhe run 1"
+
+
+class Run:
+    """What happened in a simulated or replayed run.
+
+    Attributes
+    ----------
+    dataset : xarray.Dataset
+        On `time` (monitoring times, seconds): `x_true`, `x_online`, `x_retro` by state, `y` by output, `u` by input,
+        `w` by disturbance. On `event` (samples): `sample_time`, `gap`, `y_sampled`, `x_hat`, `p_hat`, `solve_seconds`,
+        `cost`, `iterations`, `success`, `outcome`, `status`, `delivered`. Units are in the coordinates `state_unit`, ...
+        and in attributes; how the run was made is in the dataset's attributes.
+    """
+
+    def __init__(self, dataset: xr.Dataset):
+        self.dataset = dataset
+
+    @property
+    def t(self) -> Array:
+        """Monitoring times in seconds, (n,)."""
+        return self.dataset["time"].to_numpy()
+
+    @property
+    def sample_times(self) -> Array:
+        """Sampling instants t_i in seconds, (samples,)."""
+        return self.dataset["sample_time"].to_numpy()
+
+    @property
+    def gaps(self) -> Array:
+        """Seconds between samples, the first counted from the start, (samples,)."""
+        return self.dataset["gap"].to_numpy()
+
+    @property
+    def samples(self) -> int:
+        """Number of samples taken."""
+        return self.dataset.sizes["event"]
+
+    @property
+    def solves(self) -> int:
+        """Number of estimation problems solved, or tried."""
+        return self.dataset.sizes["event"]
+
+    @property
+    def measurements(self) -> int:
+        """Number of measurements (time points) that reached the estimator."""
+        return int(self.dataset.attrs["measurements"])
+
+    @property
+    def too_late(self) -> int:
+        """Number of measurements that arrived after the window had passed them."""
+        return int(self.dataset.attrs["too_late"])
+
+    @property
+    def solve_seconds(self) -> Array:
+        """Wall-clock time of every solve, (samples,)."""
+        return self.dataset["solve_seconds"].to_numpy()
+
+    @property
+    def outcomes(self) -> Mapping[str, int]:
+        """How many estimates came about in which way, such as `{"solved": 49, "predicted": 1}`; see `Outcome`."""
+        names, counts = np.unique(self.dataset["outcome"].to_numpy().astype(str), return_counts=True)
+        return {str(name): int(count) for name, count in zip(names, counts, strict=True)}
+
+    def online_error(self) -> xr.DataArray:
+        """Return the online error x_online - x_true on the monitoring times, by state."""
+        return self._error("x_online")
+
+    def retrospective_error(self) -> xr.DataArray:
+        """Return the error of the estimated trajectory (3.16) on the monitoring times, by state."""
+        return self._error("x_retro")
+
+    def online_rms(self, state: str | None = None) -> float:
+        """Return the root of the mean squared online error over the monitoring times.
+
+        Parameters
+        ----------
+        state : str, optional
+            One state's error in its unit; the Euclidean norm over all states (numbers in their units) when left out.
+
+        Raises
+        ------
+        InputError
+            When the true state is not known, as in a replayed log.
+        """
+        return self._rms("x_online", state)
+
+    def retrospective_rms(self, state: str | None = None) -> float:
+        """Return the same for the estimated trajectory (3.16), which uses data up to the next sample."""
+        return self._rms("x_retro", state)
+
+    @property
+    def ise(self) -> float:
+        """Integrated squared error of the estimated trajectory (3.16): trapezoidal rule on the monitoring times."""
+        squares = np.sum(self._error("x_retro").to_numpy() ** 2, axis=1)
+        return float(np.trapezoid(squares, self.t))
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Return a table over the monitoring times with columns `x_true.<state>`, ..., `y.<output>`, ..."""
+        import pandas as pd
+
+        columns = {}
+        for variable in ("x_true", "x_online", "x_retro", "y", "u", "w"):
+            array = self.dataset[variable]
+            names = array[array.dims[1]].to_numpy()
+            columns |= {f"{variable}.{name}": array.to_numpy()[:, i] for i, name in enumerate(names)}
+        return pd.DataFrame(columns, index=pd.Index(self.t, name="time"))
+
+    def events_to_pandas(self) -> pd.DataFrame:
+        """Return a table over the samples: time, gap, status, cost, iterations, seconds, outputs and estimates."""
+        import pandas as pd
+
+        columns: dict[str, Any] = {}
+        for variable, array in self.dataset.data_vars.items():
+            if array.dims == ("event",):
+                columns[str(variable)] = array.to_numpy()
+            elif array.dims and array.dims[0] == "event":
+                names = array[array.dims[1]].to_numpy()
+                columns |= {f"{variable}.{name}": array.to_numpy()[:, i] for i, name in enumerate(names)}
+        return pd.DataFrame(columns)
+
+    def save(self, path: str | Path) -> Path:
+        """Write the run to a NetCDF file, in one atomic step, and return its path."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f".{path.name}.{uuid4().hex}")
+        try:
+            self.dataset.to_netcdf(temporary, engine="h5netcdf")
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+        return path
+
+    @classmethod
+    def load(cls, path: str | Path) -> Run:
+        """Read a run that `save` wrote.
+
+        Raises
+        ------
+        InputError
+            If there is no such file, or it is not a run.
+        """
+        if not Path(path).is_file():
+            raise InputError(f"run: no file {str(path)!r}")
+        try:
+            with xr.open_dataset(path, engine="h5netcdf") as stored:
+                dataset = stored.load()
+        except (OSError, ValueError, KeyError) as error:
+            raise InputError(f"run: {str(path)!r} cannot be read as NetCDF: {error}") from error
+        if dataset.attrs.get("format") != FORMAT:
+            raise InputError(
+                f"run: {str(path)!r} has format {dataset.attrs.get('format')!r}, this version reads {FORMAT!r}"
+            )
+        for variable in dataset.variables.values():
+            variable.encoding = {}
+        return cls(dataset)
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw states, outputs and samples; return the array of Axes. See `ctmhe.plotting.plot_run`."""
+        from ctmhe.plotting import plot_run
+
+        return plot_run(self.dataset, axes)
+
+    def __repr__(self) -> str:
+        about, n = self.dataset.attrs, self.samples
+        rows = [
+            f"Run of {about['plant']!r}, t = {self.t[0]:g} to {self.t[-1]:g} s ({about['integrator']})",
+            f"  trigger: {about['trigger']}",
+            f"  channel: {about['channel']}",
+            f"  samples: {n}" + (f", gaps {self.gaps.min():.4g} to {self.gaps.max():.4g} s" if n else ""),
+            f"  solves: {self.solves}" + "".join(f", {count} {name}" for name, count in self.outcomes.items()),
+            f"  measurements: {self.measurements} delivered, {self.too_late} too late",
+        ]
+        if n:
+            rows.append(f"  solve time: median {1e3 * np.median(self.solve_seconds):.3g} ms")
+        if not np.isnan(self.dataset["x_true"].to_numpy()).any():
+            rows.append(f"  rms error: {self.online_rms():.4g} online, {self.retrospective_rms():.4g} retrospective")
+        return "\n".join(rows)
+
+    def _error(self, variable: str) -> xr.DataArray:
+        truth = self.dataset["x_true"]
+        unknown = np.isnan(truth.to_numpy()).any(axis=0)
+        if unknown.any():
+            names = ", ".join(map(str, self.dataset["state"].to_numpy()[unknown]))
+            raise InputError(f"run: the true value of {names} is not known (a replayed log, or another model's state)")
+        return self.dataset[variable] - truth
+
+    def _rms(self, variable: str, state: str | None) -> float:
+        if state is None:
+            return float(np.sqrt(np.mean(np.sum(self._error(variable).to_numpy() ** 2, axis=1))))
+        names = [str(name) for name in self.dataset["state"].to_numpy()]
+        if state not in names:
+            raise InputError(f"unknown state {state!r}. Known: {', '.join(names)}")
+        error = (self.dataset[variable] - self.dataset["x_true"]).to_numpy()[:, names.index(state)]
+        if np.isnan(error).any():
+            raise InputError(f"run: the true value of {state} is not known")
+        return float(np.sqrt(np.mean(error**2)))

@@ -1,0 +1,267 @@
+"""What a trigger policy is, what it is shown, and how its answers are checked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ctmhe.errors import InputError, TriggerError
+from ctmhe.types import Array, Estimate
+
+QUESTIONS = ("fires", "guard", "next_time")
+
+
+@dataclass(frozen=True, eq=False)
+class TriggerContext:
+    """What a policy may know at time `t`: only what was measured and sent so far. All arrays are read-only.
+
+    Attributes
+    ----------
+    t : float
+        Time in seconds.
+    y : array (ny,)
+        Outputs at `t` in the model's units; NaN where a sensor has no value.
+    y_last : array (ny,)
+        Outputs as last sent; NaN before the first sample.
+    elapsed : float
+        Seconds since the last sample, or since the start of the run before the first one.
+    samples : int
+        Samples sent so far.
+    outputs : tuple of str
+        Names of the entries of `y`.
+    estimate : Estimate or None
+        The last estimate, None before the first.
+    state : Any
+        The policy's own memory, see `Trigger.init_state`.
+    """
+
+    t: float
+    y: Array
+    y_last: Array
+    elapsed: float = 0.0
+    samples: int = 0
+    outputs: tuple[str, ...] = ()
+    estimate: Estimate | None = None
+    state: Any = None
+    forecast: Callable[[], tuple[Array, Array]] | None = None
+    """Returns `(prediction, y_hat)`; the simulation hands in a function that computes them once, when asked."""
+
+    @property
+    def prediction(self) -> Array:
+        """State predicted for `t`, (nx,): open loop from the last estimate with w = 0 and the last input held."""
+        return self._forecast()[0]
+
+    @property
+    def y_hat(self) -> Array:
+        """Output predicted for `t`, (ny,): h at the prediction, without noise."""
+        return self._forecast()[1]
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the last estimate (n, n), at its own time; see `Estimate.covariance`. Computed when asked."""
+        if self.estimate is None:
+            raise InputError(
+                "TriggerContext.covariance: there is no estimate before the first sample; test ctx.samples"
+            )
+        return self.estimate.covariance
+
+    def output_index(self, name: str) -> int:
+        """Return the position of output `name` in `y`."""
+        try:
+            return self.outputs.index(name)
+        except ValueError:
+            raise InputError(f"unknown output {name!r}. Known: {', '.join(self.outputs) or 'none'}") from None
+
+    def _forecast(self) -> tuple[Array, Array]:
+        if self.forecast is None:
+            raise InputError("TriggerContext: this context carries no prediction")
+        return self.forecast()
+
+
+class Trigger:
+    """A policy that says when to sample. Subclass it and write exactly one of `guard`, `next_time` and `fires`.
+
+    - `guard(ctx) -> float`, a level: a sample is taken at the first time it is >= 0, located between monitoring times
+      by root finding; where it jumps across zero, at the jump. +inf and -inf mean a certain yes and no.
+    - `next_time(ctx) -> float`, self-triggered: asked at the start and after every sample; the absolute time of the
+      next sample in seconds, inf for never.
+    - `fires(ctx) -> bool`, asked at monitoring times only. `@trigger` makes such a policy from a function.
+
+    A guard that is still >= 0 right after its own sample is asked again at the next monitoring time, so that no policy
+    samples more often than the monitoring step by standing still. `a | b` fires when the first of both does, `a & b`
+    when both agree; guards stay exactly located, times exact, and a yes from `fires` stands until the next monitoring
+    time or sample. Inside `&`, a self-triggered policy agrees from its `next_time` on.
+
+    Policies are immutable. What one has to remember lives in `ctx.state`, which `init_state` starts and `update`
+    replaces, so that one policy can serve many runs.
+    """
+
+    def guard(self, ctx: TriggerContext) -> float:
+        """Return the level; a sample is taken when it reaches zero from below."""
+        raise NotImplementedError
+
+    def next_time(self, ctx: TriggerContext) -> float:
+        """Return the absolute time of the next sample, in seconds."""
+        raise NotImplementedError
+
+    def fires(self, ctx: TriggerContext) -> bool:
+        """Return whether to sample now."""
+        raise NotImplementedError
+
+    def init_state(self) -> Any:
+        """Return the memory at the start of a run; None when there is none."""
+        return None
+
+    def update(self, ctx: TriggerContext, fired: bool) -> Any:
+        """Return the new memory. Called at every monitoring time and sample with the context before the sample.
+
+        `ctx.state` is the old memory, which must not be changed in place. `fired` tells whether a sample is taken at
+        `ctx.t`, by this or another policy.
+        """
+        return ctx.state
+
+    @property
+    def longest_wait(self) -> float:
+        """Seconds between samples that the policy declares not to exceed (delta_bar, thesis 3.19); inf if it cannot."""
+        return np.inf
+
+    def __or__(self, other: Trigger) -> Trigger:
+        from ctmhe.triggers.compose import Or
+
+        return Or.of(self, other)
+
+    def __and__(self, other: Trigger) -> Trigger:
+        from ctmhe.triggers.compose import And
+
+        return And.of(self, other)
+
+    def __repr__(self) -> str:
+        shown = []
+        for item in fields(self) if is_dataclass(self) else ():
+            value = getattr(self, item.name)
+            if item.default is MISSING or value is not item.default:
+                shown.append(f"{item.name}={value!r}")
+        return f"{type(self).__name__}({', '.join(shown)})"
+
+
+class Predicate(Trigger):
+    """A policy from a function `ctx -> bool` that is asked at monitoring times; made by `@trigger`."""
+
+    def __init__(self, function: Callable[[TriggerContext], bool]):
+        if not callable(function):
+            raise InputError(f"trigger: expected a function of the context, got {function!r}")
+        self.function = function
+        self.__doc__ = function.__doc__
+        self.__module__ = getattr(function, "__module__", type(self).__module__)
+        self.name = getattr(function, "__name__", repr(function))
+        self._path = getattr(function, "__qualname__", self.name)
+
+    def fires(self, ctx: TriggerContext) -> bool:
+        """Return what the function says."""
+        return self.function(ctx)
+
+    def __repr__(self) -> str:
+        return self.name
+
+    def __reduce__(self) -> Any:
+        import sys
+
+        if getattr(sys.modules.get(self.__module__), self._path, None) is self:
+            return self._path  # the decorated name: pickled by reference, as a function is
+        return Predicate, (self.function,)
+
+
+def trigger(function: Callable[[TriggerContext], bool]) -> Predicate:
+    """Make a policy from a function that is asked at monitoring times whether to sample.
+
+    >>> @trigger
+    ... def drifted(ctx):
+    ...     return abs(ctx.y - ctx.y_hat).max() > 0.1
+    >>> drifted | MaxInterval(0.19)
+    drifted | MaxInterval(seconds=0.19)
+    """
+    return Predicate(function)
+
+
+def kind_of(policy: Trigger) -> str:
+    """Return which of `fires`, `guard` and `next_time` a policy answers."""
+    if not isinstance(policy, Trigger):
+        hint = "call the class" if isinstance(policy, type) else "decorate a function with @trigger"
+        raise TriggerError(f"{policy!r} is not a Trigger; {hint}")
+    written = [name for name in QUESTIONS if getattr(type(policy), name) is not getattr(Trigger, name)]
+    if len(written) != 1:
+        raise TriggerError(
+            f"policy {policy!r} must define exactly one of {', '.join(QUESTIONS)}; it defines "
+            f"{', '.join(written) or 'none'}. Write two policies and join them with | or &"
+        )
+    return written[0]
+
+
+def call(policy: Trigger, method: str, ctx: TriggerContext, *arguments: Any) -> Any:
+    """Call a method of a policy; whatever it raises becomes a `TriggerError` that names the policy and the time."""
+    try:
+        return getattr(policy, method)(ctx, *arguments)
+    except TriggerError:
+        raise
+    except Exception as error:
+        hint = ""
+        if "read-only" in str(error) or "cannot assign to field" in str(error):
+            hint = "; the context is read-only: copy an array before changing it, keep memory in update()"
+        raise TriggerError(
+            f"policy {policy!r}: {method} failed at t = {ctx.t:.9g}: {type(error).__name__}: {error}{hint}"
+        ) from error
+
+
+def ask_level(policy: Trigger, ctx: TriggerContext) -> float:
+    """Return the checked value of `guard`."""
+    value = call(policy, "guard", ctx)
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.item()
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise TriggerError(
+            f"policy {policy!r}: guard returned {value!r} at t = {ctx.t:.9g}; expected a number that reaches zero when "
+            "a sample is due (for yes or no, write fires or use @trigger)"
+        )
+    if np.isnan(value):
+        raise TriggerError(
+            f"policy {policy!r}: guard returned NaN at t = {ctx.t:.9g}. ctx.y_last is NaN before the first sample "
+            "(ctx.samples == 0) and ctx.y where a sensor has no value: return inf or -inf there"
+        )
+    return float(value)
+
+
+def ask_yes(policy: Trigger, ctx: TriggerContext) -> bool:
+    """Return the checked answer of `fires`."""
+    value = call(policy, "fires", ctx)
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.item()
+    if not isinstance(value, (bool, np.bool_)):
+        hint = " (is a return missing?)" if value is None else ""
+        raise TriggerError(f"policy {policy!r} returned {value!r} at t = {ctx.t:.9g}; expected True or False{hint}")
+    return bool(value)
+
+
+def ask_time(policy: Trigger, ctx: TriggerContext, earliest: float) -> float:
+    """Return the checked answer of `next_time`: not NaN and not before `earliest`."""
+    value = call(policy, "next_time", ctx)
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.item()
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise TriggerError(
+            f"policy {policy!r}: next_time returned {value!r} at t = {ctx.t:.9g}; expected an absolute time in "
+            "seconds, inf for never"
+        )
+    if not value >= earliest:
+        raise TriggerError(
+            f"policy {policy!r}: next_time returned {value!r} at t = {ctx.t:.9g}, which does not lie ahead; return an "
+            "absolute time after ctx.t (ctx.t + wait), inf for never"
+        )
+    return float(value)
+
+
+def remember(policy: Trigger, ctx: TriggerContext, state: Any, fired: bool) -> Any:
+    """Return the policy's memory after `update`."""
+    return call(policy, "update", replace(ctx, state=state), fired)

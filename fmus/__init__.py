@@ -1,0 +1,1 @@
+"""Example models as FMUs: C sources in `src/`, built for this machine by `fmus.build`."""
