@@ -1,1 +1,66 @@
-"""ctmhe."""
+"""ctmhe: continuous-time, event-triggered moving horizon estimation with FMU support."""
+
+from importlib.metadata import PackageNotFoundError, version
+
+from ctmhe.data import MeasurementLog
+from ctmhe.errors import CtmheError, FmuError, InputError, MissingExtra, ModelError, NotEstimated, TooLate, TriggerError
+from ctmhe.estimators import MHE, Prediction, State
+from ctmhe.models import ContinuousModel, DiscreteModel
+from ctmhe.models.fmu import FmuModel
+from ctmhe.simulation import Everything, FmuPlant, Gaussian, OdePlant, Recorded, Run, SingleSample, Uniform, WholeSignal, replay, simulate
+from ctmhe.transcription import CVODES, RK4
+from ctmhe.triggers import Innovation, MaxInterval, MinInterval, Periodic, Scheduled, SendOnDelta, Trigger, TriggerContext, trigger
+from ctmhe.types import Bounds, DiscountedCost, Estimate, Input, Measurement, Outcome, Status, Trajectory
+
+try:
+    __version__ = version("ctmhe")
+except PackageNotFoundError:  # running from a source tree that is not installed
+    __version__ = "0+unknown"
+
+__all__ = [
+    "Bounds",
+    "CVODES",
+    "ContinuousModel",
+    "CtmheError",
+    "DiscountedCost",
+    "DiscreteModel",
+    "Estimate",
+    "Everything",
+    "FmuError",
+    "FmuModel",
+    "FmuPlant",
+    "Gaussian",
+    "Innovation",
+    "Input",
+    "InputError",
+    "MHE",
+    "MaxInterval",
+    "Measurement",
+    "MeasurementLog",
+    "MinInterval",
+    "MissingExtra",
+    "ModelError",
+    "NotEstimated",
+    "OdePlant",
+    "Outcome",
+    "Periodic",
+    "Prediction",
+    "RK4",
+    "Recorded",
+    "Run",
+    "Scheduled",
+    "SendOnDelta",
+    "SingleSample",
+    "State",
+    "Status",
+    "TooLate",
+    "Trajectory",
+    "Trigger",
+    "TriggerContext",
+    "TriggerError",
+    "Uniform",
+    "WholeSignal",
+    "replay",
+    "simulate",
+    "trigger",
+]

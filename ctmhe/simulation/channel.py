@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import Protocol
 
 from ctmhe.errors import InputError
 from ctmhe.triggers.compose import positive
@@ -65,10 +65,14 @@ class WholeSignal:
     """
 
     every: float | None = None
-    holds: ClassVar[tuple[str, ...]] = ("zero", "linear")
 
     def __post_init__(self) -> None:
         _check_every(self)
+
+    @property
+    def holds(self) -> tuple[str, ...]:
+        """A signal known between its records."""
+        return ("zero", "linear")
 
     def interval(self, monitor: float) -> float | None:
         """Return the seconds between records."""
@@ -83,7 +87,10 @@ class WholeSignal:
 class SingleSample:
     """One value of every sensor, at the event; for `hold="point"`. What a network of smart sensors sends."""
 
-    holds: ClassVar[tuple[str, ...]] = ("point",)
+    @property
+    def holds(self) -> tuple[str, ...]:
+        """Single values."""
+        return ("point",)
 
     def interval(self, monitor: float) -> float | None:
         """Return None: there are no routine records."""
@@ -105,10 +112,14 @@ class Everything:
     """
 
     every: float | None = None
-    holds: ClassVar[tuple[str, ...]] = ("zero", "linear")
 
     def __post_init__(self) -> None:
         _check_every(self)
+
+    @property
+    def holds(self) -> tuple[str, ...]:
+        """A signal known between its records."""
+        return ("zero", "linear")
 
     def interval(self, monitor: float) -> float | None:
         """Return the seconds between records."""

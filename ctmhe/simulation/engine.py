@@ -13,10 +13,10 @@ from ctmhe.errors import InputError, TooLate, TriggerError
 from ctmhe.estimators.mhe import MHE
 from ctmhe.models.signals import Signals
 from ctmhe.simulation.channel import Channel, Delivery, check_hold
+from ctmhe.simulation.drivers import Driver
 from ctmhe.simulation.plants import Plant
 from ctmhe.simulation.recorder import Recorder
 from ctmhe.simulation.run import Run
-from ctmhe.simulation.signals import Driver
 from ctmhe.triggers.base import Trigger, TriggerContext
 from ctmhe.triggers.timing import tolerance
 from ctmhe.triggers.watch import Watch, WatchState

@@ -183,10 +183,12 @@ class _Buffered:
         self.w, self.p = self._arguments[3][: sizes[3]], self._arguments[4][: sizes[4]]
         self._x, self._u = self._arguments[1], self._arguments[2][: sizes[2]]
         self._result = np.zeros(shape, order="F")
-        self._buffer, self._evaluate = function.buffer()
+        buffer: Any
+        buffer, self._evaluate = function.buffer()
+        self._buffer = buffer
         for i, argument in enumerate(self._arguments):
-            self._buffer.set_arg(i, memoryview(argument))
-        self._buffer.set_res(0, memoryview(self._result.reshape(-1, order="F")))
+            buffer.set_arg(i, memoryview(argument))  # type: ignore[arg-type]
+        buffer.set_res(0, memoryview(self._result.reshape(-1, order="F")))  # type: ignore[arg-type]
 
     def __call__(self, t: float, x: Array, u: Array) -> Array:
         self._arguments[0][0] = t

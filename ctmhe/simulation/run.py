@@ -27,9 +27,9 @@ class Run:
     ----------
     dataset : xarray.Dataset
         On `time` (monitoring times, seconds): `x_true`, `x_online`, `x_retro` by state, `y` by output, `u` by input,
-        `w` by disturbance. On `event` (samples): `sample_time`, `gap`, `y_sampled`, `x_hat`, `p_hat`, `solve_seconds`,
-        `cost`, `iterations`, `success`, `outcome`, `status`, `delivered`. Units are in the coordinates `state_unit`, ...
-        and in attributes; how the run was made is in the dataset's attributes.
+        `w` by disturbance. On `event` (samples): `sample_time`, `gap`, `y_sampled`, `x_hat`, `p_hat`,
+        `solve_seconds`, `cost`, `iterations`, `success`, `outcome`, `status`, `delivered`. Units are in the coordinates
+        `state_unit`, ... and in attributes; how the run was made is in the dataset's attributes.
     """
 
     def __init__(self, dataset: xr.Dataset):

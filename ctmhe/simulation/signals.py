@@ -5,32 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
-from zlib import crc32
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ctmhe.errors import InputError
 from ctmhe.models.signals import Signals
+from ctmhe.simulation.drivers import BLOCK, Cells, Driver, Joined, Sampled, Table
 from ctmhe.types import Array, Input, Values, frozen
-
-BLOCK = 256
-"""Cells drawn at once; part of what a seed means, so never changed."""
-
-EDGE = 1e-6
-"""Fraction of a cell within which an instant counts as lying on the cell's edge."""
-
-
-class Driver(Protocol):
-    """A signal bound to names, defined for all times, that is smooth (for w: constant) between its jumps."""
-
-    def next_jump(self, t: float) -> float:
-        """Return the first jump after `t` in seconds, inf if none."""
-        ...
-
-    def segment(self, a: float, b: float) -> tuple[Array, Array]:
-        """Return the values at the start and the end of [a, b], which has no jump inside."""
-        ...
 
 
 class Process(Protocol):
@@ -71,7 +53,7 @@ class Uniform:
         if not (lower <= upper).all():
             worst = signals.names[int(np.flatnonzero(~(lower <= upper))[0])]
             raise InputError(f"Uniform: {worst!r} has its lower limit above the upper one")
-        return _Cells(signals, seed, self.interval, lambda rng: rng.random(BLOCK), lower, upper - lower)
+        return Cells(signals, seed, self.interval, lambda rng: rng.random(BLOCK), lower, upper - lower)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +80,7 @@ class Gaussian:
         if not (std >= 0).all():
             raise InputError(f"Gaussian: std must be >= 0, got {self.std!r}")
         draw: Callable[[np.random.Generator], Array] = lambda rng: rng.standard_normal(BLOCK)  # noqa: E731
-        return _Cells(signals, seed, self.interval, draw, np.zeros(len(signals)), std)
+        return Cells(signals, seed, self.interval, draw, np.zeros(len(signals)), std)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +103,7 @@ class Waveform:
 
     def bind(self, signals: Signals, seed: int) -> Driver:
         """Return the signal for `signals`; the seed plays no part."""
-        return _Sampled(self.function, signals, self.interval, shift=0.5)
+        return Sampled(self.function, signals, self.interval, shift=0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +141,7 @@ class Recorded:
                 rows[:, signals.index(name)] = _rows(column, len(t), 1, name)[:, 0]
         else:
             rows = _rows(self.values, len(t), len(signals), ", ".join(signals.names))
-        return _Table(t, frozen(rows), linear=self.hold == "linear")
+        return Table(t, frozen(rows), linear=self.hold == "linear")
 
 
 Drive = Process | Mapping[str, Process | float] | None
@@ -169,7 +151,7 @@ Inputs = Process | Callable[[float], ArrayLike] | Sequence[Input] | Values | Non
 def bind_disturbance(drive: Drive, signals: Signals, seed: int) -> Driver:
     """Return the disturbance of a plant: one process for all signals, or one for each name, zero where none is."""
     if drive is None:
-        return _Table(np.zeros(1), np.zeros((1, len(signals))), linear=False)
+        return Table(np.zeros(1), np.zeros((1, len(signals))), linear=False)
     if isinstance(drive, Mapping):
         parts: list[tuple[int, Driver]] = []
         for name, process in drive.items():
@@ -179,7 +161,7 @@ def bind_disturbance(drive: Drive, signals: Signals, seed: int) -> Driver:
                 parts.append((index, Recorded([0.0], [process]).bind(one, seed)))
             else:
                 parts.append((index, _bind(process, one, seed)))
-        return _Joined(len(signals), parts)
+        return Joined(len(signals), parts)
     if not hasattr(drive, "bind"):
         raise InputError(
             f"disturbance: expected a process such as Uniform(0.1), or a mapping from {signals.kind} name to one; got "
@@ -198,14 +180,14 @@ def bind_inputs(inputs: Inputs, signals: Signals, monitor: float) -> Driver:
     if inputs is None or (isinstance(inputs, (list, tuple)) and not len(inputs)):
         if len(signals):
             raise InputError(
-                f"inputs: the plant has {len(signals)} ({', '.join(signals.names)}); give inputs= as values, a function "
-                "of time, a list of Input, or Recorded"
+                f"inputs: the plant has {len(signals)} ({', '.join(signals.names)}); give inputs= as values, a "
+                "function of time, a list of Input, or Recorded"
             )
-        return _Table(np.zeros(1), np.zeros((1, 0)), linear=False)
+        return Table(np.zeros(1), np.zeros((1, 0)), linear=False)
     if hasattr(inputs, "bind"):
         return inputs.bind(signals, 0)  # type: ignore[union-attr]
     if callable(inputs):
-        return _Sampled(inputs, signals, monitor, shift=0.0)
+        return Sampled(inputs, signals, monitor, shift=0.0)
     if isinstance(inputs, (list, tuple)) and isinstance(inputs[0], Input):
         if not all(isinstance(item, Input) for item in inputs):
             raise InputError("inputs: a list must hold Input values only")
@@ -213,7 +195,7 @@ def bind_inputs(inputs: Inputs, signals: Signals, monitor: float) -> Driver:
         ordered = sorted(switches, key=lambda item: item.t)
         rows = [signals.vector(item.u, f"inputs at t = {item.t:g}") for item in ordered]
         return Recorded([item.t for item in ordered], np.array(rows)).bind(signals, 0)
-    return _Table(np.zeros(1), signals.vector(inputs, "inputs").reshape(1, -1), linear=False)
+    return Table(np.zeros(1), signals.vector(inputs, "inputs").reshape(1, -1), linear=False)
 
 
 def seed_of(seed: int | np.random.Generator) -> int:
@@ -223,88 +205,6 @@ def seed_of(seed: int | np.random.Generator) -> int:
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise InputError(f"seed must be a non-negative integer or a numpy Generator, got {seed!r}")
     return int(seed)
-
-
-class _Cells:
-    """Random values by cell, drawn in blocks so that cell k of a name is the same whoever asks, in any order."""
-
-    def __init__(self, signals: Signals, seed: int, interval: float, draw: Callable, offset: Array, scale: Array):
-        self.keys = [(seed, crc32(name.encode())) for name in signals.names]
-        self.interval, self.draw = float(interval), draw
-        self.offset, self.scale = offset, scale
-        self.blocks: dict[int, Array] = {}
-
-    def next_jump(self, t: float) -> float:
-        return (np.floor(t / self.interval + EDGE) + 1) * self.interval
-
-    def segment(self, a: float, b: float) -> tuple[Array, Array]:
-        block, row = divmod(int(np.floor(0.5 * (a + b) / self.interval)), BLOCK)
-        if block not in self.blocks:
-            if len(self.blocks) >= 8:
-                self.blocks.pop(next(iter(self.blocks)))
-            self.blocks[block] = np.column_stack(
-                [self.draw(np.random.default_rng([*key, block % 2**32])) for key in self.keys]
-            )
-        value = self.offset + self.scale * self.blocks[block][row]
-        return value, value
-
-
-class _Sampled:
-    """A function of time, held on cells at its value at their start plus `shift` cells."""
-
-    def __init__(self, function: Callable[[float], ArrayLike], signals: Signals, interval: float, shift: float):
-        self.function, self.signals, self.interval, self.shift = function, signals, float(interval), shift
-
-    def next_jump(self, t: float) -> float:
-        return (np.floor(t / self.interval + EDGE) + 1) * self.interval
-
-    def segment(self, a: float, b: float) -> tuple[Array, Array]:
-        at = (np.floor(0.5 * (a + b) / self.interval) + self.shift) * self.interval
-        value = self.signals.vector(self.function(at), f"{self.signals.kind} function at t = {at:g}")
-        return value, value
-
-
-class _Table:
-    """Values at given times, held or linear in between."""
-
-    def __init__(self, t: Array, rows: Array, linear: bool):
-        self.t, self.rows, self.linear = t, rows, linear
-
-    def next_jump(self, t: float) -> float:
-        if len(self.t) == 1:
-            return np.inf
-        k = int(np.searchsorted(self.t, t + EDGE * self._gap(t), side="right"))
-        return float(self.t[k]) if k < len(self.t) else np.inf
-
-    def segment(self, a: float, b: float) -> tuple[Array, Array]:
-        last = len(self.t) - 1
-        k = int(np.searchsorted(self.t, 0.5 * (a + b), side="right")) - 1
-        if not self.linear or k < 0 or k == last:
-            value = self.rows[min(max(k, 0), last)]
-            return value, value
-        share = (np.clip([a, b], self.t[k], self.t[k + 1]) - self.t[k]) / (self.t[k + 1] - self.t[k])
-        step = self.rows[k + 1] - self.rows[k]
-        return self.rows[k] + share[0] * step, self.rows[k] + share[1] * step
-
-    def _gap(self, t: float) -> float:
-        k = int(np.clip(np.searchsorted(self.t, t), 1, len(self.t) - 1))
-        return float(self.t[k] - self.t[k - 1])
-
-
-class _Joined:
-    """One driver for each of some signals, zero for the others."""
-
-    def __init__(self, size: int, parts: list[tuple[int, Driver]]):
-        self.size, self.parts = size, parts
-
-    def next_jump(self, t: float) -> float:
-        return min((driver.next_jump(t) for _, driver in self.parts), default=np.inf)
-
-    def segment(self, a: float, b: float) -> tuple[Array, Array]:
-        value = np.zeros(self.size)
-        for index, driver in self.parts:
-            value[index] = driver.segment(a, b)[0][0]
-        return value, value
 
 
 def _bind(process: Process, signals: Signals, seed: int) -> Driver:

@@ -1,0 +1,1 @@
+"""Studies: published results reproduced, and the demonstration."""

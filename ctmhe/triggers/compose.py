@@ -64,8 +64,8 @@ class And(Combined):
 class MinInterval(Trigger):
     """Dead time: no sample within `seconds` of the last, t_i - t_(i-1) >= seconds.
 
-    Used as `policy & MinInterval(0.05)`. The first sample is not held back. When the dead time ends while the policy's guard is >= 0, the sample is taken at
-    that very moment.
+    Used as `policy & MinInterval(0.05)`. The first sample is not held back. When the dead time ends while the policy's
+    guard is >= 0, the sample is taken at that very moment.
 
     Parameters
     ----------

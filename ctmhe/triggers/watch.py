@@ -67,7 +67,7 @@ class Watch:
         return self._plan(empty, ctx, earliest=ctx.t)
 
     def ask(self, state: WatchState, ctx: TriggerContext) -> WatchState:
-        """Ask the yes-or-no policies at a monitoring time; the answers stand until the next. Silent guards speak again."""
+        """Ask the yes-or-no policies at a monitoring time; the answers stand until the next. Guards speak again."""
         rows = zip(self.leaves, self.kinds, state.standings, strict=True)
         return WatchState(
             tuple(

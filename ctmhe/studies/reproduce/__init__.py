@@ -1,0 +1,24 @@
+"""Published results, one file each; every case returns `published`, `ours`, `settings` and `comment`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from ctmhe.errors import InputError
+from ctmhe.studies.reproduce import thesis_3_4_1_ct
+
+CASES: dict[str, Callable[..., dict[str, Any]]] = {"thesis-3.4.1-ct": thesis_3_4_1_ct.reproduce}
+
+
+def reproduce(case: str, **options: Any) -> dict[str, Any]:
+    """Run a case by name; keywords such as `seeds=` go to it.
+
+    Raises
+    ------
+    InputError
+        For an unknown case.
+    """
+    if case not in CASES:
+        raise InputError(f"unknown case {case!r}. Known: {', '.join(CASES)}")
+    return CASES[case](**options)
