@@ -1,6 +1,7 @@
 """Plants, disturbances, channels, and the loop that runs them with a trigger and an estimator."""
 
 from ctmhe.simulation.channel import Channel, Delivery, Everything, Link, SingleSample, WholeSignal
+from ctmhe.simulation.fmu_plant import FmuPlant
 from ctmhe.simulation.loop import simulate
 from ctmhe.simulation.plants import MapPlant, OdePlant, Plant
 from ctmhe.simulation.replay import replay
@@ -11,6 +12,7 @@ __all__ = [
     "Channel",
     "Delivery",
     "Everything",
+    "FmuPlant",
     "Gaussian",
     "Link",
     "MapPlant",

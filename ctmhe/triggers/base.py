@@ -142,7 +142,8 @@ class Trigger:
         shown = []
         for item in fields(self) if is_dataclass(self) else ():
             value = getattr(self, item.name)
-            if item.default is MISSING or value is not item.default:
+            plain = isinstance(value, (str, int, float, type(None)))
+            if item.default is MISSING or not (plain and value == item.default):
                 shown.append(f"{item.name}={value!r}")
         return f"{type(self).__name__}({', '.join(shown)})"
 

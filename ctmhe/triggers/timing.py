@@ -13,12 +13,12 @@ from ctmhe.triggers.compose import positive
 from ctmhe.types import Array, finite_time
 
 SAME = 1e-9
-"""Seconds (relative beyond 1 s) within which two instants count as one."""
+"""Seconds within which two instants count as one (more where rounding alone is larger)."""
 
 
 def tolerance(t: float) -> float:
     """Return the distance in seconds within which an instant counts as `t`."""
-    return SAME * max(1.0, abs(t))
+    return max(SAME, 1e-14 * abs(t))
 
 
 @dataclass(frozen=True, repr=False)

@@ -29,9 +29,7 @@ def context(t=1.0, y=(0.0,), y_last=(0.0,), samples=1, y_hat=None, **more):
     """Build a context with outputs a, b, ... and prediction `y_hat`."""
     prediction = None if y_hat is None else (lambda: (frozen([0.0]), frozen(y_hat)))
     names = tuple("abcdef"[: len(y)])
-    return TriggerContext(
-        t, frozen(y), frozen(y_last), samples=samples, outputs=names, forecast=prediction, **more
-    )
+    return TriggerContext(t, frozen(y), frozen(y_last), samples=samples, outputs=names, forecast=prediction, **more)
 
 
 def level(policy, ctx):
@@ -217,8 +215,7 @@ def test_a_configuration_builds_what_python_builds():
     assert repr(build_trigger(spec)) == repr(SendOnDelta(0.05) | MaxInterval(0.19))
     spec = {"all": [spec, {"name": "MinInterval", "seconds": 0.01}]}
     assert (
-        repr(build_trigger(spec))
-        == "(SendOnDelta(delta=0.05) | MaxInterval(seconds=0.19)) & MinInterval(seconds=0.01)"
+        repr(build_trigger(spec)) == "(SendOnDelta(delta=0.05) | MaxInterval(seconds=0.19)) & MinInterval(seconds=0.01)"
     )
 
 

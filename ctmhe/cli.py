@@ -1,0 +1,127 @@
+"""The command line: `ctmhe demo`, `estimate`, `fmu info`, `reproduce`."""
+
+from __future__ import annotations
+
+import json
+import sys
+import textwrap
+from importlib.metadata import version as installed_version
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from ctmhe.errors import CtmheError
+
+app = typer.Typer(
+    help="Continuous-time, event-triggered moving horizon estimation with FMU support.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+fmu_app = typer.Typer(help="Look into FMUs.", no_args_is_help=True)
+app.add_typer(fmu_app, name="fmu")
+
+
+def _version(value: bool) -> None:
+    if value:
+        typer.echo(f"ctmhe {installed_version('ctmhe')}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _options(
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the plot and the runs.")] = Path("demo"),
+    seed: Annotated[int, typer.Option(help="Seed of disturbance and noise.")] = 0,
+) -> None:
+    """Estimate the reactor FMU under an event trigger, beside periodic sampling with as many samples."""
+    from ctmhe.studies.demo import report, run_demo, write
+
+    demonstration = run_demo(seed=seed)
+    event = demonstration.event.dataset.attrs
+    typer.echo(f"plant     {event['plant']} ({event['integrator']})")
+    typer.echo(f"trigger   {event['trigger']}, channel {event['channel']}")
+    typer.echo(f"estimator {event['estimator']}\n")
+    typer.echo(report(demonstration))
+    paths = write(demonstration, out)
+    typer.echo("\nwritten: " + ", ".join(str(path) for path in paths))
+
+
+@app.command()
+def estimate(
+    fmu: Annotated[Path, typer.Option(help="The FMU (model exchange).")],
+    log: Annotated[Path, typer.Option(help="CSV file with the measurements.")],
+    config: Annotated[Path, typer.Option(help="TOML file: tables model, log, estimator, guess, trigger, channel.")],
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("results"),
+    trigger: Annotated[
+        str | None, typer.Option(help="A policy of your own, file.py:Name, in place of the configuration's.")
+    ] = None,
+) -> None:
+    """Estimate from a recorded log with an FMU as the model."""
+    from ctmhe.studies.case import Case
+    from ctmhe.studies.demo import save_plot
+    from ctmhe.triggers.loading import load_trigger
+
+    policy = load_trigger(trigger) if trigger else None
+    case = Case.load(fmu=fmu, log=log, config=config, trigger=policy)
+    run = case.run(progress=sys.stderr.isatty())
+    typer.echo(repr(run))
+    out.mkdir(parents=True, exist_ok=True)
+    run.save(out / "run.nc")
+    run.to_pandas().to_csv(out / "estimates.csv")
+    run.events_to_pandas().to_csv(out / "events.csv")
+    save_plot(run, out / "estimates.png")
+    typer.echo(f"\nwritten: {out / 'run.nc'}, estimates.csv, events.csv, estimates.png")
+
+
+@fmu_app.command("info")
+def fmu_info(path: Annotated[Path, typer.Argument(help="The FMU.")]) -> None:
+    """Print what an FMU is and what it offers."""
+    from ctmhe.models.fmu import describe
+
+    typer.echo(describe(path))
+
+
+@app.command()
+def reproduce(
+    case: Annotated[str, typer.Argument(help="Name of a published result, such as thesis-3.4.1-ct; `list` shows all.")],
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the result as JSON.")] = None,
+    seeds: Annotated[int, typer.Option(help="Seeded runs.", min=1)] = 20,
+) -> None:
+    """Reproduce a published result and print it beside the published numbers."""
+    from ctmhe.studies.reproduce import CASES
+    from ctmhe.studies.reproduce import reproduce as run_case
+
+    if case == "list":
+        typer.echo("\n".join(CASES))
+        return
+    result = run_case(case, seeds=seeds, progress=sys.stderr.isatty())
+    for part in ("published", "ours"):
+        typer.echo(f"{part}:")
+        typer.echo(textwrap.indent(json.dumps(result[part], indent=2), "  "))
+    typer.echo(textwrap.fill(result["comment"], 100))
+    if json_file is not None:
+        json_file.parent.mkdir(parents=True, exist_ok=True)
+        json_file.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+        typer.echo(f"written: {json_file}")
+
+
+def main() -> None:
+    """Run the command line; an error of this library is one readable paragraph and exit code 1."""
+    try:
+        app()
+    except CtmheError as error:
+        typer.echo(textwrap.fill(f"ctmhe: {error}", 100, break_long_words=False), err=True)
+        raise SystemExit(1) from None
+
+
+if __name__ == "__main__":
+    main()
