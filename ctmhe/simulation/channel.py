@@ -60,8 +60,8 @@ class WholeSignal:
     Parameters
     ----------
     every : float, optional
-        Seconds between records, at absolute multiples; the monitoring step when left out. The value at the event
-        itself is recorded too.
+        Seconds between records, at absolute multiples; the monitoring step when left out. The values at the start and
+        at the event itself are recorded too.
     """
 
     every: float | None = None
@@ -108,7 +108,7 @@ class Everything:
     Parameters
     ----------
     every : float, optional
-        Seconds between records, at absolute multiples; the monitoring step when left out.
+        Seconds between records, at the start and absolute multiples; the monitoring step when left out.
     """
 
     every: float | None = None

@@ -142,7 +142,7 @@ class Loop:
         return np.inf if step is None else (np.floor(t / step + 1e-9) + 1) * step
 
     def _record_due(self, grid: int | None) -> bool:
-        if self.sample_time is not None:
+        if grid == 0 or self.sample_time is not None:
             return grid is not None and self.recording
         step, t = self.record_step, self.now.t
         return step is not None and abs(t - round(t / step) * step) <= tolerance(t)

@@ -16,7 +16,7 @@ from ctmhe.errors import MissingExtra, SolverError
 from ctmhe.models.continuous import Model
 from ctmhe.types import Array
 
-MAX_STEPS = 200_000
+MAX_STEPS = 50_000
 
 
 class Integration(Protocol):

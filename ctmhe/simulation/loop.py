@@ -50,7 +50,7 @@ def simulate(
     ----------
     plant : Plant or Model
         A model is integrated by `OdePlant` (`MapPlant` when discrete). Signals are matched with the estimator's by
-        name.
+        name. It is started anew and left open.
     mhe : MHE
     trigger : Trigger
     until : float
@@ -68,7 +68,8 @@ def simulate(
     disturbance : process, or mapping name -> process or constant, optional
         Such as `Uniform(1e-3)`; zero when left out.
     inputs : values, callable t -> values, list of Input, or Recorded, optional
-        Known inputs; the estimator is told as they happen. A function is sampled at monitoring times and held.
+        Known inputs; the estimator is told as they happen. A function is sampled at monitoring times and held. Linear
+        ones want an estimator with `input_hold="linear"`. The start values of an FMU when left out.
     monitor : float, optional
         Monitoring step in seconds: multiples of it are the times at which policies are asked and results are kept.
         0.01 when left out, the step of a discrete-time plant or model, whose guards are asked at monitoring times only.
@@ -103,6 +104,8 @@ def simulate(
     if monitor <= 0:
         raise InputError(f"simulate: monitor must be a positive number of seconds, got {monitor:g}")
     number = seed_of(seed)
+    if inputs is None:
+        inputs = getattr(plant, "u_start", getattr(getattr(plant, "model", None), "u_start", None))
     loop = Loop(
         plant,
         mhe,
@@ -115,10 +118,7 @@ def simulate(
         seed=number,
         locate=step is None,
     )
-    try:
-        return loop.run(truth=truth, p_true=p_true, guess=guess, p=p, progress=progress)
-    finally:
-        plant.close()
+    return loop.run(truth=truth, p_true=p_true, guess=guess, p=p, progress=progress)
 
 
 def monitoring_times(start: float, until: float, monitor: float) -> Array:

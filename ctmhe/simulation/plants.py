@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
+import casadi as ca
 import numpy as np
 
 from ctmhe.errors import InputError
@@ -71,7 +72,8 @@ class _Moment:
 class OdePlant:
     """A continuous-time model as plant, dx/dt = f(t, x, u, w, p) (thesis 3.7).
 
-    One solution runs on as long as the input stays on one line and w does not change; it is restarted only there.
+    One solution runs on as long as the input stays on one line and the part of w that enters f does not change; it is
+    restarted only there (measurement noise restarts nothing).
 
     Parameters
     ----------
@@ -96,9 +98,10 @@ class OdePlant:
         if model.step is not None:
             raise InputError(f"model {model.name!r} is discrete-time: use MapPlant(model)")
         self.model, self.name = model, model.name
-        self.x, self.u, self.w, self.y = model.x, model.u, model.w, model.y
+        self.x, self.u, self.w, self.y, self.p = model.x, model.u, model.w, model.y, model.p
         self._integration: Integration = integration_of(model, rtol, atol, backend)
         self.integrator = f"{self._integration.name}, rtol {rtol:g}, atol {atol:g}"
+        self._driving = driving_disturbances(model)
         self._p = model.p_start
         self._now: _Moment | None = None
         self._line: tuple[float, Array, Array, Array] | None = None
@@ -153,7 +156,11 @@ class OdePlant:
         scale = 1e-12 * np.asarray(self.u.nominal)
         same_input = (np.abs(slope - slope_line) <= scale + 1e-9 * np.abs(slope_line)).all()
         drift = np.abs(u0 - u_line - slope_line * (t - t_line))
-        return bool(same_input and (drift <= scale + 1e-12 * np.abs(u0)).all() and np.array_equal(w, w_line))
+        return bool(
+            same_input
+            and (drift <= scale + 1e-12 * np.abs(u0)).all()
+            and np.array_equal(w[self._driving], w_line[self._driving])
+        )
 
 
 class MapPlant:
@@ -169,7 +176,7 @@ class MapPlant:
         if model.step is None:
             raise InputError(f"model {model.name!r} is continuous-time: use OdePlant(model)")
         self.model, self.name, self.step = model, model.name, float(model.step)
-        self.x, self.u, self.w, self.y = model.x, model.u, model.w, model.y
+        self.x, self.u, self.w, self.y, self.p = model.x, model.u, model.w, model.y, model.p
         self.integrator = f"step map, {self.step:g} s"
         self._p = model.p_start
         self._now: _Moment | None = None
@@ -232,6 +239,14 @@ def start_state(model: Model, x: Array | None) -> Array:
     if x is None and own is None:
         raise InputError(f"plant {model.name!r} has no start state of its own; give truth= ({', '.join(model.x)})")
     return model.x.vector(own if x is None else x, "truth")
+
+
+def driving_disturbances(model: Model) -> np.ndarray:
+    """Return which disturbances enter f, (nw,) bool; all where that cannot be told from the expressions."""
+    if not model.dynamics.is_a("SXFunction") or not len(model.w):
+        return np.ones(len(model.w), dtype=bool)
+    pattern = ca.DM(model.dynamics.jac_sparsity(0, 3), 1)
+    return np.asarray(ca.DM(pattern)).any(axis=0)
 
 
 def started(plant: OdePlant | MapPlant) -> _Moment:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -153,12 +154,17 @@ class Recorder:
         return Run(data)
 
     def _true_parameters(self, p_true: Any) -> Array | None:
-        model, source = self.loop.model, getattr(self.loop.plant, "model", None)
-        signals: Signals | None = getattr(source, "p", None)
-        if signals is None or source is None or not all(name in signals.names for name in model.p):
-            return None
-        values = source.p_start if p_true is None else signals.vector(p_true, "p_true")
-        return np.array([values[signals.names.index(name)] for name in model.p])
+        """Return the plant's values of the model's parameters, None where the plant does not tell."""
+        model, plant = self.loop.model, self.loop.plant
+        signals: Signals = getattr(plant, "p", model.p)
+        known: dict[str, float] = {}
+        if hasattr(plant, "model"):
+            known |= dict(zip(signals.names, plant.model.p_start, strict=True))  # type: ignore[attr-defined]
+        if isinstance(p_true, Mapping):
+            known |= p_true
+        elif p_true is not None:
+            known |= dict(zip(signals.names, signals.vector(p_true, "p_true"), strict=True))
+        return np.array([known[name] for name in model.p]) if set(model.p.names) <= set(known) else None
 
 
 def _names(dim: str, group: Signals) -> dict[str, Any]:

@@ -182,11 +182,12 @@ class Run:
 
     def __repr__(self) -> str:
         about, n = self.dataset.attrs, self.samples
+        between = self.gaps[1:]
         rows = [
             f"Run of {about['plant']!r}, t = {self.t[0]:g} to {self.t[-1]:g} s ({about['integrator']})",
             f"  trigger: {about['trigger']}",
             f"  channel: {about['channel']}",
-            f"  samples: {n}" + (f", gaps {self.gaps.min():.4g} to {self.gaps.max():.4g} s" if n else ""),
+            f"  samples: {n}" + (f", gaps {between.min():.4g} to {between.max():.4g} s" if n > 1 else ""),
             f"  solves: {self.solves}" + "".join(f", {count} {name}" for name, count in self.outcomes.items()),
             f"  measurements: {self.measurements} delivered, {self.too_late} too late",
         ]

@@ -68,7 +68,7 @@ class Ipopt:
         size = program.capacity
         guess = clip_to_bounds(window, guess)
         x_scale, w_scale = np.tile(window.x_scale, size + 1), np.tile(window.w_scale, size)
-        x = _extended(guess.x, size + 1, 0.0)
+        x = _extended(guess.x, size + 1)
         w = _extended(guess.w, size, 0.0)
         differences = np.diff(w, axis=0, append=w[-1:])
         start = np.concatenate(
@@ -80,7 +80,7 @@ class Ipopt:
             ]
         )
         lower, upper = (
-            self._bounds(window, size, *sides)
+            self._bounds(window, x[n + 1 :], *sides)
             for sides in (
                 (window.x_lower, window.w_lower, window.p_lower, -np.inf),
                 (window.x_upper, window.w_upper, window.p_upper, np.inf),
@@ -212,15 +212,16 @@ class Ipopt:
             "weighted_slot", [*symbols, Lw, Ly, data], [x_next, y[(q - 1) * ny :], ca.vertcat(*residuals)]
         )
 
-    def _bounds(self, window: Window, size: int, x: Array, w: Array, p: Array, free: float) -> Array:
+    def _bounds(self, window: Window, spare: Array, x: Array, w: Array, p: Array, free: float) -> Array:
         n, stage = len(window.mesh), self.stage
+        size = n + len(spare)
         differences = np.full((size, stage.nw), free)
         differences[np.flatnonzero(window.mesh.shared)] = 0.0
         differences[n:] = 0.0
         fixed = p if window.p_estimated else window.prior[stage.nx :]
         return np.concatenate(
             [
-                _extended(x / window.x_scale, size + 1, 0.0).reshape(-1),
+                np.concatenate([x, spare]).reshape(-1) / np.tile(window.x_scale, size + 1),
                 _extended(w / window.w_scale, size, 0.0).reshape(-1),
                 differences.reshape(-1),
                 fixed / window.p_scale,

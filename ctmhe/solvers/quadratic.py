@@ -137,7 +137,7 @@ class KKT:
 
         The primal-dual active set method (a semismooth Newton method): each pass solves the equality-constrained
         problem, then drops held bounds whose multiplier has the wrong sign and holds violated ones. When a set comes
-        back, only the single worst change is made from then on.
+        back, or holds bounds that depend on each other, only the single worst change is made from then on.
 
         Raises
         ------
@@ -145,9 +145,15 @@ class KKT:
             If the KKT matrix cannot be factorised, or no consistent set was found in `max_changes` passes.
         """
         seen: set[bytes] = set()
-        single = False
+        single, cautious = False, None  # cautious: the single worst change to the last set that could be factorised
         for attempt in range(max_changes):
-            step = self._equality_constrained(qp, active, damping)
+            try:
+                step = self._equality_constrained(qp, active, damping)
+            except Singular:
+                if single or cautious is None:
+                    raise
+                single, active = True, cautious
+                continue
             candidate, worst = self._update(qp, step, active)
             if candidate is None:
                 return Step(
@@ -156,6 +162,7 @@ class KKT:
             key = candidate.key()
             single = single or key in seen
             seen.add(key)
+            cautious = worst
             active = worst if single else candidate
         raise Singular(f"no consistent set of active bounds in {max_changes} passes")
 

@@ -36,6 +36,8 @@ class TriggerContext:
         The last estimate, None before the first.
     state : Any
         The policy's own memory, see `Trigger.init_state`.
+    forecast : callable or None
+        Returns `(prediction, y_hat)`; the simulation hands in a function that computes them once, when asked.
     """
 
     t: float
@@ -47,7 +49,6 @@ class TriggerContext:
     estimate: Estimate | None = None
     state: Any = None
     forecast: Callable[[], tuple[Array, Array]] | None = None
-    """Returns `(prediction, y_hat)`; the simulation hands in a function that computes them once, when asked."""
 
     @property
     def prediction(self) -> Array:
@@ -178,6 +179,7 @@ class Predicate(Trigger):
 def trigger(function: Callable[[TriggerContext], bool]) -> Predicate:
     """Make a policy from a function that is asked at monitoring times whether to sample.
 
+    >>> from ctmhe.triggers import MaxInterval
     >>> @trigger
     ... def drifted(ctx):
     ...     return abs(ctx.y - ctx.y_hat).max() > 0.1
@@ -261,6 +263,14 @@ def ask_time(policy: Trigger, ctx: TriggerContext, earliest: float) -> float:
             "absolute time after ctx.t (ctx.t + wait), inf for never"
         )
     return float(value)
+
+
+def initial_memory(policy: Trigger) -> Any:
+    """Return the policy's memory at the start of a run."""
+    try:
+        return policy.init_state()
+    except Exception as error:
+        raise TriggerError(f"policy {policy!r}: init_state failed: {type(error).__name__}: {error}") from error
 
 
 def remember(policy: Trigger, ctx: TriggerContext, state: Any, fired: bool) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ctmhe.triggers.base import Trigger, TriggerContext, ask_level, ask_time, ask_yes, kind_of, remember
+from ctmhe.triggers.base import Trigger, TriggerContext, ask_level, ask_time, ask_yes, initial_memory, kind_of, remember
 from ctmhe.triggers.compose import And, Combined
 from ctmhe.triggers.timing import tolerance
 
@@ -63,7 +63,7 @@ class Watch:
 
     def start(self, ctx: TriggerContext) -> WatchState:
         """Return the state at the start of a run; self-triggered policies name their first time."""
-        empty = WatchState(tuple(Standing(memory=leaf.init_state()) for leaf in self.leaves))
+        empty = WatchState(tuple(Standing(memory=initial_memory(leaf)) for leaf in self.leaves))
         return self._plan(empty, ctx, earliest=ctx.t)
 
     def ask(self, state: WatchState, ctx: TriggerContext) -> WatchState:

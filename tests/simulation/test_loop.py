@@ -283,9 +283,9 @@ class TestRefusals:
 
     def test_a_declared_wait_not_shorter_than_the_horizon(self, mhe):
         """Thesis (3.19): T > delta_bar."""
-        with pytest.raises(InputError, match="3.19"):
+        with pytest.raises(InputError, match=r"3\.19"):
             run(mhe, SendOnDelta(0.1) | MaxInterval(1.0))
-        with pytest.raises(InputError, match="3.19"):
+        with pytest.raises(InputError, match=r"3\.19"):
             run(mhe, Periodic(1.5))
 
     def test_signals_that_do_not_match(self, mhe):
@@ -347,7 +347,7 @@ def test_inputs_reach_plant_and_estimator_alike():
     cases = [
         (held, [2.0], lambda t: 2 * t),
         (held, switches, lambda t: t if t < 0.25 else 0.25 + 3 * (t - 0.25)),
-        (held, lambda t: [10 * t], lambda t: np.sum(np.floor(10 * np.arange(round(t * 10)) / 10 * 10)) * 0.1),
+        (held, lambda t: [10 * t], lambda t: 0.1 * sum(range(round(10 * t)))),
         (linear, ramp, lambda t: t**2),
     ]
     for mhe, inputs, exact in cases:

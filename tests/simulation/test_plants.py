@@ -1,11 +1,13 @@
 """Plants: accurate, restartable, and clear about what they cannot do."""
 
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ctmhe.errors import InputError, SolverError
+from ctmhe.errors import InputError, MissingExtra, SolverError
 from ctmhe.models.continuous import ContinuousModel
 from ctmhe.models.discrete import DiscreteModel
 from ctmhe.simulation import MapPlant, OdePlant
@@ -42,7 +44,7 @@ def test_a_plant_solves_its_differential_equation(backend):
 @given(st.floats(0.01, 0.99), st.floats(-1, 1), st.floats(-1, 1))
 @settings(max_examples=10, deadline=None)
 def test_restore_brings_the_plant_back_exactly(backend, split, force, disturbance):
-    """From a checkpoint, the same drive leads to the same state to the bit."""
+    """At the checkpoint the state is the same to the bit, and so is where the same drive leads from there."""
     plant = OdePlant(OSCILLATOR, backend=backend)
     plant.start(0.0, np.array([1.0, 0.0]))
     u, w = np.array([force]), np.array([disturbance, 0.0])
@@ -50,10 +52,10 @@ def test_restore_brings_the_plant_back_exactly(backend, split, force, disturbanc
     there, state = plant.checkpoint(), plant.state().copy()
     ends = []
     for _ in range(2):
-        plant.advance(0.3 + split, 2 * u, u, w)
-        ends.append(plant.state().copy())
         plant.restore(there)
         np.testing.assert_array_equal(plant.state(), state)
+        plant.advance(0.3 + split, 2 * u, u, w)
+        ends.append(plant.state().copy())
     np.testing.assert_array_equal(*ends)
 
 
@@ -82,6 +84,27 @@ def test_a_solution_that_ends_says_where(backend, capfd):
     plant.advance(0.5, np.zeros(0), np.zeros(0), np.zeros(0))
     assert plant.state()[0] == pytest.approx(2.0, rel=1e-4)
     assert capfd.readouterr() == ("", "")
+
+
+def test_measurement_noise_does_not_restart_the_solution(monkeypatch):
+    """Only disturbances that enter f, and changes of the input's slope, begin a new solution."""
+    plant = OdePlant(OSCILLATOR, backend="casadi")
+    starts = []
+    monkeypatch.setattr(plant._integration, "restart", lambda *a: starts.append(a))
+    monkeypatch.setattr(plant._integration, "to", lambda t: np.zeros(2))
+    plant.start(0.0, np.array([1.0, 0.0]))
+    for k, (v, d, u) in enumerate([(0, 0, 0), (1, 0, 0), (2, 0, 0), (2, 1, 0), (2, 1, 5), (3, 1, 5)]):
+        plant.advance(float(k + 1), np.array([u]), np.array([u]), np.array([d, v], dtype=float))
+    assert len(starts) == 3
+
+
+def test_a_missing_backend_names_the_extra(monkeypatch):
+    """scikits.odes asked for but absent."""
+    monkeypatch.setitem(sys.modules, "scikits_odes_sundials.cvode", None)
+    with pytest.raises(MissingExtra, match=r"ctmhe\[sundials\]"):
+        OdePlant(OSCILLATOR, backend="scikits.odes")
+    with pytest.raises(SolverError, match="'lsoda'"):
+        OdePlant(OSCILLATOR, backend="lsoda")
 
 
 def test_models_become_plants_and_nothing_else_does():

@@ -1,10 +1,12 @@
 """Runs as results: errors, tables, files, figures; and replays of what was recorded."""
 
+import sys
+
 import numpy as np
 import pytest
 
 from ctmhe.data import MeasurementLog
-from ctmhe.errors import InputError
+from ctmhe.errors import InputError, MissingExtra
 from ctmhe.estimators import MHE
 from ctmhe.models.continuous import ContinuousModel
 from ctmhe.simulation import Run, SingleSample, Uniform, replay, simulate
@@ -123,6 +125,13 @@ def test_a_run_draws_itself(result):
     with pytest.raises(InputError, match="4 axes are needed"):
         result.plot(grid[0])
     pyplot.close("all")
+
+
+def test_drawing_without_matplotlib_names_the_extra(result, monkeypatch):
+    """The library is imported late, and its absence says what to install."""
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(MissingExtra, match=r"ctmhe\[plot\]"):
+        result.plot()
 
 
 def log_of(result):

@@ -85,7 +85,7 @@ def test_a_waveform_is_held_at_the_middle_of_its_cells():
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: Uniform(),
+        lambda: Uniform(low=1.0),
         lambda: Uniform(1.0, low=0.0, high=1.0),
         lambda: Uniform(1.0, interval=0.0),
         lambda: Uniform(low=1.0, high=0.0).bind(W, 0),
