@@ -7,9 +7,31 @@ from ctmhe.errors import CtmheError, FmuError, InputError, MissingExtra, ModelEr
 from ctmhe.estimators import MHE, Prediction, State
 from ctmhe.models import ContinuousModel, DiscreteModel
 from ctmhe.models.fmu import FmuModel
-from ctmhe.simulation import Everything, FmuPlant, Gaussian, OdePlant, Recorded, Run, SingleSample, Uniform, WholeSignal, replay, simulate
+from ctmhe.simulation import (
+    Everything,
+    FmuPlant,
+    Gaussian,
+    OdePlant,
+    Recorded,
+    Run,
+    SingleSample,
+    Uniform,
+    WholeSignal,
+    replay,
+    simulate,
+)
 from ctmhe.transcription import CVODES, RK4
-from ctmhe.triggers import Innovation, MaxInterval, MinInterval, Periodic, Scheduled, SendOnDelta, Trigger, TriggerContext, trigger
+from ctmhe.triggers import (
+    Innovation,
+    MaxInterval,
+    MinInterval,
+    Periodic,
+    Scheduled,
+    SendOnDelta,
+    Trigger,
+    TriggerContext,
+    trigger,
+)
 from ctmhe.types import Bounds, DiscountedCost, Estimate, Input, Measurement, Outcome, Status, Trajectory
 
 try:
@@ -18,8 +40,10 @@ except PackageNotFoundError:  # running from a source tree that is not installed
     __version__ = "0+unknown"
 
 __all__ = [
-    "Bounds",
     "CVODES",
+    "MHE",
+    "RK4",
+    "Bounds",
     "ContinuousModel",
     "CtmheError",
     "DiscountedCost",
@@ -33,7 +57,6 @@ __all__ = [
     "Innovation",
     "Input",
     "InputError",
-    "MHE",
     "MaxInterval",
     "Measurement",
     "MeasurementLog",
@@ -45,7 +68,6 @@ __all__ = [
     "Outcome",
     "Periodic",
     "Prediction",
-    "RK4",
     "Recorded",
     "Run",
     "Scheduled",

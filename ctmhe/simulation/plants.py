@@ -246,7 +246,7 @@ def driving_disturbances(model: Model) -> np.ndarray:
     if not model.dynamics.is_a("SXFunction") or not len(model.w):
         return np.ones(len(model.w), dtype=bool)
     pattern = ca.DM(model.dynamics.jac_sparsity(0, 3), 1)
-    return np.asarray(ca.DM(pattern)).any(axis=0)
+    return np.atleast_1d(np.any(np.asarray(pattern), axis=0))
 
 
 def started(plant: OdePlant | MapPlant) -> _Moment:

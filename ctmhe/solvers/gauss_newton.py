@@ -35,7 +35,7 @@ class GaussNewton:
 
     Each iteration linearises all slots, solves the quadratic program with its bounds, and takes a step that decreases
     the exact penalty function J/2 + rho (|dynamics defect|_1 + |output bound excess|_1), backtracking where needed;
-    when no step does, a Levenberg term is added and raised. It stops when the decrease that the model predicts falls below
+    when no step does, a Levenberg term is added and raised. It stops when the predicted decrease falls below
     `tolerance` relative to the cost and the dynamics hold. Gauss-Newton converges linearly where residuals are large
     and the model is curved; when that is slow, the second derivatives of the stage (symbolic models) are added and
     the last iterations are Newton's.

@@ -78,7 +78,10 @@ def report(demonstration: Demonstration) -> str:
         ("", "event-triggered", "periodic"),
         ("samples", f"{event.samples}", f"{periodic.samples}"),
         ("solves", f"{event.solves}", f"{periodic.solves}"),
-        ("shortest / longest gap [s]", *(f"{run.gaps[1:].min():.3f} / {run.gaps.max():.3f}" for run in (event, periodic))),
+        (
+            "shortest / longest gap [s]",
+            *(f"{run.gaps[1:].min():.3f} / {run.gaps.max():.3f}" for run in (event, periodic)),
+        ),
         ("online RMS error [bar]", f"{event.online_rms():.4f}", f"{periodic.online_rms():.4f}"),
         ("  of it after 1 s", f"{settled_rms(event):.4f}", f"{settled_rms(periodic):.4f}"),
         ("retrospective RMS error [bar]", f"{event.retrospective_rms():.4f}", f"{periodic.retrospective_rms():.4f}"),

@@ -28,8 +28,6 @@ class Combined(Trigger):
     @classmethod
     def of(cls, left: Trigger, right: Trigger) -> Trigger:
         """Join two policies, flattening what is joined by the same operator already."""
-        if not isinstance(right, Trigger):
-            return NotImplemented
         sides = [side.parts if type(side) is cls else (side,) for side in (left, right)]
         return cls(*sides[0], *sides[1])
 

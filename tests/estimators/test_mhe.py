@@ -237,7 +237,9 @@ def test_output_and_residual_bounds_hold():
         state = feed(mhe, mhe.init(x=[0.3, 0]), [0.2, 0.6, 1.0], [[0.5, 0.0], [0.2, 0.0], [0.4, 0.0]])
         _, estimate = mhe.estimate(state, 1.0)
         free = oscillator_mhe(hold="point")
-        _, unbounded = free.estimate(feed(free, free.init(x=[0.3, 0]), [0.2, 0.6, 1.0], [[0.5, 0], [0.2, 0], [0.4, 0]]), 1.0)
+        _, unbounded = free.estimate(
+            feed(free, free.init(x=[0.3, 0]), [0.2, 0.6, 1.0], [[0.5, 0], [0.2, 0], [0.4, 0]]), 1.0
+        )
         assert estimate.status.success and estimate.cost > unbounded.cost
         if bounds.y is not None:
             assert estimate.trajectory.y[:, 0].max() <= 0.35 + 1e-8
@@ -332,7 +334,8 @@ def test_bad_measurements_raise_and_leave_the_state_unchanged():
 
 
 @pytest.mark.parametrize(
-    ("x", "message"), [([1.0], "expected 2 state values"), ([np.nan, 1], "'pA' is nan"), ({"pA": 1.0}, "no value for state pB")]
+    ("x", "message"),
+    [([1.0], "expected 2 state values"), ([np.nan, 1], "'pA' is nan"), ({"pA": 1.0}, "no value for state pB")],
 )
 def test_bad_guesses_are_refused(x, message):
     """The initial estimate needs every state, finite."""
@@ -345,7 +348,7 @@ def test_a_model_with_inputs_needs_one_before_the_window():
     model = ContinuousModel(lambda t, x, u, w, p: -x + u, lambda t, x, u, w, p: x, x="x", u="valve", y="y")
     mhe = MHE(model, horizon=1, interval=0.1, integrator=RK4(0.1), cost=DiscountedCost())
     state = mhe.init(x=[1.0])
-    with pytest.raises(InputError, match="no input is known.*valve"):
+    with pytest.raises(InputError, match=r"no input is known.*valve"):
         mhe.estimate(state, 0.5)
     with pytest.raises(InputError, match="input 'valve' is nan"):
         mhe.control(state, Input(0.0, [np.nan]))

@@ -141,14 +141,16 @@ def REACTORLESS(eta):
 
 
 def test_the_truth_never_costs_less_than_the_estimate(rng):
-    """With cells anchored at absolute multiples the true w is feasible, so J(optimal) <= J(truth) on windows of any edge."""
+    """With cells anchored at absolute multiples the true w is feasible: J(optimal) <= J(truth) on any window."""
     from ctmhe.estimators import MHE
     from ctmhe.transcription import RK4
     from ctmhe.transcription.problem import Guess, cost_of, rollout
     from tests.conftest import REACTOR_COST
 
     model = batch_reactor()
-    mhe = MHE(model, horizon=0.5, interval=0.1, integrator=RK4(0.02), cost=REACTOR_COST, bounds=model.bounds, hold="point")
+    mhe = MHE(
+        model, horizon=0.5, interval=0.1, integrator=RK4(0.02), cost=REACTOR_COST, bounds=model.bounds, hold="point"
+    )
     w = rng.uniform(-0.1, 0.1, (20, 3))
     truth = {0.0: np.array([3.0, 1.0])}
     state, x, t = mhe.init(x=[0.1, 4.5]), truth[0.0], 0.0
@@ -156,12 +158,16 @@ def test_the_truth_never_costs_less_than_the_estimate(rng):
         x, _ = mhe.stage.step(t, 0.01, x, w[k // 10], np.empty(0), np.empty(0), np.empty(0))
         t = round((k + 1) * 0.01, 10)
         truth[t] = x
-        state = mhe.observe(state, Measurement(t, [x.sum() + w[min((k + 1) // 10, 19) if (k + 1) % 10 else k // 10][2]]))
+        state = mhe.observe(
+            state, Measurement(t, [x.sum() + w[min((k + 1) // 10, 19) if (k + 1) % 10 else k // 10][2]])
+        )
     checked = 0
     for t in (0.33, 0.57, 0.93):
         start = max(0.0, round(t - 0.5, 10))
         prior, factor, _ = mhe._prior(state, max(0.0, t - 0.5), t <= 0.5)
-        window = mhe.assembly.window(start, t, mhe._records(state, t, start), prior, growing=t <= 0.5, prior_factor=factor)
+        window = mhe.assembly.window(
+            start, t, mhe._records(state, t, start), prior, growing=t <= 0.5, prior_factor=factor
+        )
         true_w = w[window.mesh.cell]
         point = rollout(mhe.stage, window, truth[start], np.empty(0), true_w)
         mesh = window.mesh

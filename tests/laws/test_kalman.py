@@ -109,7 +109,7 @@ def test_samples_between_cell_edges_are_counted_at_their_own_time(rng):
 
 
 def test_covariance_converges_to_kalman_bucy_with_the_cells():
-    """With the whole signal, halving the cells divides the distance to the Riccati equation's solution by at least 3."""
+    """With the whole signal, halving the cells divides the distance to the Riccati solution by at least 3."""
     A, B, C = np.array([[0, 1.0], [-2, -0.3]]), np.eye(2), np.array([[1.0, 0]])
     P, Q, R = np.diag([2.0, 3.0]), np.diag([5.0, 8.0]), 6.0
 
@@ -122,7 +122,12 @@ def test_covariance_converges_to_kalman_bucy_with_the_cells():
     errors = []
     for h in (0.4, 0.2, 0.1):
         mhe = MHE(
-            linear_model(A, B, C), horizon=5, interval=h, integrator=RK4(0.02), cost=DiscountedCost(P=P, Q=Q, R=R), hold="zero"
+            linear_model(A, B, C),
+            horizon=5,
+            interval=h,
+            integrator=RK4(0.02),
+            cost=DiscountedCost(P=P, Q=Q, R=R),
+            hold="zero",
         )
         _, estimate = mhe.estimate(feed(mhe, mhe.init(x=[0, 0]), [0.0], [[0.0]]), end)
         errors.append(np.abs(estimate.covariance - exact).max())
@@ -133,7 +138,14 @@ def test_silent_sensor_with_correlated_noise_drops_from_the_covariance():
     """R of the remaining sensor is the inverse of its block of R^-1, not the block of R."""
     R = np.array([[4.0, 3.0], [3.0, 4.0]])
     cost = DiscountedCost(P=1.0, Q=1e8, R=R)
-    mhe = MHE(linear_model([[0.0]], [[1.0]], [[1.0], [1.0]]), horizon=5, interval=1, integrator=RK4(1), cost=cost, hold="point")
+    mhe = MHE(
+        linear_model([[0.0]], [[1.0]], [[1.0], [1.0]]),
+        horizon=5,
+        interval=1,
+        integrator=RK4(1),
+        cost=cost,
+        hold="point",
+    )
     state = feed(mhe, mhe.init(x=[0.0]), [0.0], [[1.0, np.nan]])
     _, estimate = mhe.estimate(state, 0.0)
     r = 1 / np.linalg.inv(R)[0, 0]

@@ -119,7 +119,9 @@ def test_multipliers_have_the_sign_of_their_bound(rng):
     scale = np.abs(reference.multipliers.x).max()
     np.testing.assert_allclose(z, reference.multipliers.x, atol=1e-3 * scale)
     np.testing.assert_allclose(ours.multipliers.dynamics, reference.multipliers.dynamics, atol=1e-3 * scale)
-    np.testing.assert_array_equal(held[np.abs(z) > 1e-2 * scale], np.sign(reference.multipliers.x)[np.abs(z) > 1e-2 * scale])
+    np.testing.assert_array_equal(
+        held[np.abs(z) > 1e-2 * scale], np.sign(reference.multipliers.x)[np.abs(z) > 1e-2 * scale]
+    )
 
 
 def test_second_derivatives_end_slow_convergence():
@@ -161,9 +163,7 @@ def test_ipopt_doubles_its_capacity_and_says_so(caplog):
     """A window with more slots than the program holds rebuilds it once, logged; smaller ones reuse it."""
     import logging
 
-    mhe = MHE(
-        batch_reactor(), horizon=1.0, interval=0.1, integrator=RK4(0.1), cost=REACTOR_COST, solver="ipopt"
-    )
+    mhe = MHE(batch_reactor(), horizon=1.0, interval=0.1, integrator=RK4(0.1), cost=REACTOR_COST, solver="ipopt")
     with caplog.at_level(logging.INFO, logger="ctmhe"):
         state = mhe.observe(mhe.init(x=[2.0, 1.0]), Measurement(0.1, [2.9]))
         state, _ = mhe.estimate(state, 0.5)

@@ -193,6 +193,7 @@ def test_a_policy_that_fails_or_returns_nonsense_is_reported_by_name(policy, mes
         lambda: build_trigger("mine.py:Name"),
         lambda: build_trigger({"any": []}),
         lambda: build_trigger({}),
+        lambda: SendOnDelta(1.0) | (lambda ctx: True),
         lambda: load_trigger("nowhere.py:Name"),
         lambda: load_trigger("nowhere"),
     ],

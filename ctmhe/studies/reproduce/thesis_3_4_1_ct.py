@@ -54,7 +54,7 @@ def lyapunov(error: Array) -> Array:
 
 
 def bound_ratios(mhe: MHE, run: Run, times: Array, rho: float) -> dict[str, float]:
-    """Return the largest ratio of the left to the right side of (3.32): the estimator, open loop, the constant guess."""
+    """Return the largest left over right side of (3.32): the estimator, open loop, the constant guess."""
     data, nothing = run.dataset, np.empty(0)
     w, grid_truth = data["w"].values[:-1], data["x_true"].values
     truth = np.empty((len(times), 2))
@@ -174,8 +174,8 @@ def reproduce(*, seeds: int = 20, progress: bool = False) -> dict[str, Any]:
 
 
 COMMENT = (
-    "The thesis prints rho, delta_bar and the largest solve time; its errors are shown in a figure only. At |w| <= 0.1 the "
-    "bound (3.32) is so wide that even the constant guess may stay below it; at |w| <= 1e-3 the open-loop prediction from the "
-    "wrong guess exceeds it (ratio above 1) and the estimator stays below. For equidistant samples delta_bar = 0.1 is used; "
-    "Remark 3.7 would allow 0."
+    "The thesis prints rho, delta_bar and the largest solve time; its errors are shown in a figure only. At |w| <= 0.1 "
+    "the bound (3.32) is so wide that even the constant guess may stay below it; at |w| <= 1e-3 the open-loop prediction "
+    "from the wrong guess exceeds it (ratio above 1) and the estimator stays below. For equidistant samples "
+    "delta_bar = 0.1 is used; Remark 3.7 would allow 0."
 )
