@@ -199,7 +199,7 @@ pd.DataFrame(found, index=NAMES).T.rename_axis(["estimated by", "sigma"]).round(
 # ## The second record
 # p is held at what the first record gave. Both filters run through the record; what they predict for the next sample gives the
 # **one-step** error. After 100 s (25 samples) the measurements stop and the model runs alone to the end: the
-# **free-run** error. MHE: a window of 100 s, prior weight = inverse covariance of the fit above.
+# **free-run** error. MHE: a window of 60 s, prior weight = inverse covariance of the fit above.
 
 # %%
 WARM = 25
@@ -207,7 +207,7 @@ WARM = 25
 
 def mhe_one_step(record, sigma, p):
     """Return the same as `ekf` for a moving window."""
-    mhe = tanks_mhe(sigma, 100.0, P=np.linalg.inv(fits[sigma].covariance[:2, :2]))
+    mhe = tanks_mhe(sigma, 60.0, P=np.linalg.inv(fits[sigma].covariance[:2, :2]))
     state = mhe.init(t=0.0, x=[5.0, record[1][0]], p=p)
     predicted, filtered, seconds = [], [], []
     for k, (pump, level) in enumerate(zip(*record, strict=True)):

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.optimize import brentq
 
 from ctmhe.errors import InputError, TooLate, TriggerError
 from ctmhe.estimators.mhe import MHE
@@ -257,6 +256,8 @@ class Loop:
         if level(a) >= 0:
             at = a
         else:
+            from scipy.optimize import brentq
+
             at = float(brentq(level, a, b, xtol=LOCATED, rtol=4 * np.finfo(float).eps, maxiter=200))  # type: ignore[arg-type]
             nudge = LOCATED
             while at < b and level(at) < 0:

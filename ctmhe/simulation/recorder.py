@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from ctmhe.models.signals import Signals
 from ctmhe.simulation.run import FORMAT, Run
@@ -122,6 +121,8 @@ class Recorder:
         truth = self._true_parameters(p_true)
         if truth is not None:
             variables["p_true"] = ("parameter", truth)
+        import xarray as xr
+
         data = xr.Dataset(
             {name: (*value, {"long_name": MESSAGES[name]}) for name, value in variables.items()},
             coords={"time": ("time", np.array(self.times), {"units": "s"}), "event": np.arange(len(self.events))},

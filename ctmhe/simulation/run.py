@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
 import numpy as np
-import xarray as xr
 
 from ctmhe.errors import InputError
 from ctmhe.types import Array
 
 if TYPE_CHECKING:
     import pandas as pd
+    import xarray as xr
 
 FORMAT = "ctmhe run 1"
 
@@ -162,6 +162,8 @@ class Run:
         if not Path(path).is_file():
             raise InputError(f"run: no file {str(path)!r}")
         try:
+            import xarray as xr
+
             with xr.open_dataset(path, engine="h5netcdf") as stored:
                 dataset = stored.load()
         except (OSError, ValueError, KeyError) as error:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import casadi as ca
 import numpy as np
-from scipy.optimize import brentq
 
 from ctmhe.errors import InputError
 from ctmhe.models.continuous import ContinuousModel
@@ -170,5 +169,7 @@ def cstr_steady_states(T_c: float = 300.0, *, h: float = 0.659) -> Array:
     grid = np.linspace(coldest - 1e-6, hottest + 1e-6, 2001)
     values = np.array([heat(T) for T in grid])
     crossings = np.flatnonzero(np.signbit(values[:-1]) != np.signbit(values[1:]))
+    from scipy.optimize import brentq
+
     roots = [float(np.asarray(brentq(heat, grid[i], grid[i + 1], xtol=1e-12))) for i in crossings]
     return frozen([[concentration(T), T, h] for T in roots])

@@ -175,7 +175,7 @@ def reproduce(*, seeds: int = 20, progress: bool = False) -> dict[str, Any]:
 
 COMMENT = (
     "The thesis prints rho, delta_bar and the largest solve time; its errors are shown in a figure only. At |w| <= 0.1 "
-    "the bound (3.32) is so wide that even the constant guess may stay below it; at |w| <= 1e-3 the open-loop prediction "
-    "from the wrong guess exceeds it (ratio above 1) and the estimator stays below. For equidistant samples "
+    "the bound (3.32) is so wide that even the constant guess may stay below it; at |w| <= 1e-3 the open-loop "
+    "prediction from the wrong guess exceeds it (ratio above 1) and the estimator stays below. For equidistant samples "
     "delta_bar = 0.1 is used; Remark 3.7 would allow 0."
 )
