@@ -34,10 +34,10 @@ from ctmhe.models.library import cascaded_tanks
 
 NAMES = ("k1", "k2", "k3", "k4")
 model = cascaded_tanks(noise=False, parameters=NAMES)  # the output residual is the noise; w drives the two levels
-BLACK, ORANGE, BLUE, GREEN = "#000000", "#D55E00", "#0072B2", "#009E73"
+BLACK, ORANGE, BLUE = "#000000", "#D55E00", "#0072B2"
 plt.rcParams.update(
     {
-        "figure.dpi": 80,
+        "figure.dpi": 75,
         "axes.grid": True,
         "grid.color": "#dddddd",
         "axes.spines.top": False,
@@ -89,7 +89,7 @@ file = root / ".." / "shared" / "data" / "cascaded_tanks" / "dataBenchmark.csv"
 if file.exists():
     table = pd.read_csv(file)
     first, second = (tuple(table[name + half].to_numpy() for name in "uy") for half in ("Est", "Val"))
-    SOURCE = "benchmark record"
+    SOURCE = "Benchmark record"
 else:
     first, second = simulated(1), simulated(2)
     SOURCE = "SIMULATED STAND-IN, not the benchmark"
@@ -121,7 +121,7 @@ def fit(record, sigma):
     return mhe.estimate(state, STEP * (len(record[0]) - 1))[1]
 
 
-SIGMAS = (0.1, 0.03, 0.01, 0.003)
+SIGMAS = (0.1, 0.03, 0.01)
 fits = {sigma: fit(first, sigma) for sigma in SIGMAS}
 for sigma, estimate in fits.items():
     status = estimate.status
@@ -150,7 +150,7 @@ for axis in axes[:2]:
 axes[2].set(ylabel="disturbance [mV/s]", xlabel="time [min]")
 for axis in axes:
     axis.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0.1)
-axes[0].set_title(f"{SOURCE}, first half; dashed: rim", loc="left", fontsize=10)
+axes[0].set_title(f"{SOURCE} 1; dashed: rim", loc="left", fontsize=10)
 axes[0].set_xlim(0, minutes[-1])
 plt.show()
 
@@ -191,15 +191,13 @@ def ekf(record, sigma, p, spread):
 
 found = {("MHE, whole record", sigma): estimate.p for sigma, estimate in fits.items()}
 found |= {("EKF, last value", sigma): ekf(first, sigma, GUESS, SPREAD)[1][-1, 2:] for sigma in SIGMAS}
-print(f"Parameters from the first record ({SOURCE})")
-pd.DataFrame(found, index=NAMES).T.rename_axis(["estimated by", "sigma"]).round(4)
 
 
 # %% [markdown]
 # ## The second record
 # p is held at what the first record gave. Both filters run through the record; what they predict for the next sample gives the
 # **one-step** error. After 100 s (25 samples) the measurements stop and the model runs alone to the end: the
-# **free-run** error. MHE: a window of 60 s, prior weight = inverse covariance of the fit above.
+# **free-run** error. MHE: a window of 40 s, prior weight = inverse covariance of the fit above.
 
 # %%
 WARM = 25
@@ -207,7 +205,7 @@ WARM = 25
 
 def mhe_one_step(record, sigma, p):
     """Return the same as `ekf` for a moving window."""
-    mhe = tanks_mhe(sigma, 60.0, P=np.linalg.inv(fits[sigma].covariance[:2, :2]))
+    mhe = tanks_mhe(sigma, 40.0, P=np.linalg.inv(fits[sigma].covariance[:2, :2]))
     state = mhe.init(t=0.0, x=[5.0, record[1][0]], p=p)
     predicted, filtered, seconds = [], [], []
     for k, (pump, level) in enumerate(zip(*record, strict=True)):
@@ -235,23 +233,22 @@ def rms(error):
 later = tuple(signal[WARM:] for signal in second)
 SIGMA = 0.03
 rows, curves = {}, {}
-for who, p_held in {
-    "p as guessed": GUESS,
-    "p from EKF": found["EKF, last value", SIGMA],
-    "p from MHE": found["MHE, whole record", SIGMA],
-}.items():
+for who in ("EKF, last value", "MHE, whole record"):
+    p_held = found[who, SIGMA]
     by_ekf, x_ekf = ekf(second, SIGMA, p_held, np.zeros(4))
     by_mhe, x_mhe, seconds = mhe_one_step(second, SIGMA, p_held)
-    curves[who] = free_run(x_mhe[WARM], later, p_held)
-    rows[who] = {
+    curves[f"p from {who}"] = alone = free_run(x_mhe[WARM], later, p_held)
+    rows[f"p from {who}"] = {
         "one step, EKF": rms(by_ekf[WARM:] - later[1]),
         "one step, MHE": rms(by_mhe[WARM:] - later[1]),
         "free run from EKF": rms(free_run(x_ekf[WARM, :2], later, p_held) - later[1]),
-        "free run from MHE": rms(curves[who] - later[1]),
+        "free run from MHE": rms(alone - later[1]),
     }
+curves["p as guessed"] = free_run(ekf(second, SIGMA, GUESS, np.zeros(4))[1][WARM, :2], later, GUESS)
 persistence = rms(np.diff(second[1])[WARM - 1 :])
 print(f"RMS error in V on the second record ({SOURCE}), sigma = {SIGMA:g} V/√s")
-print(f"for scale: 'the level stays as it is' predicts one step to {persistence:.3f} V")
+print(f"for scale: 'the level stays as it is' errs {persistence:.3f} V in one step;", end=" ")
+print(f"p as guessed errs {rms(curves['p as guessed'] - later[1]):.2f} V in the free run")
 print(f"median time of one MHE update: {1e3 * seconds:.1f} ms")
 pd.DataFrame(rows).T.round(3)
 
@@ -259,32 +256,33 @@ pd.DataFrame(rows).T.round(3)
 figure, axes = plt.subplots(2, 1, figsize=(9, 5), sharex=True, layout="constrained", height_ratios=[2, 1])
 minutes = STEP / 60 * (WARM + np.arange(len(later[1])))
 axes[0].plot(minutes, later[1], color=BLACK, lw=3, alpha=0.3, label="measured")
-for (who, curve), color, style in zip(curves.items(), ("#999999", ORANGE, BLUE), (":", "--", "-"), strict=True):
+for (who, curve), color, style in zip(curves.items(), (ORANGE, BLUE, "#999999"), ("--", "-", ":"), strict=True):
     axes[0].plot(minutes, curve, color=color, ls=style, lw=1.2, label=who)
     axes[1].plot(minutes, curve - later[1], color=color, ls=style, lw=1.2)
 axes[0].set(ylabel="lower level [V]", xlim=(minutes[0], minutes[-1]))
-axes[0].set_title(f"{SOURCE}, second half: free run", loc="left", fontsize=10)
+axes[0].set_title(f"{SOURCE} 2, free run", loc="left", fontsize=10)
 axes[0].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=4, borderaxespad=0.1)
 axes[1].set(ylabel="error [V]", xlabel="time [min]", ylim=(-2.5, 2.5))
 plt.show()
 
 # %% [markdown]
-# ## What sigma decides
-# A small `sigma` forces the fit to follow the model for 68 minutes; a large one lets w absorb what the model lacks.
-# The free-run error of the second record (never used above) as `sigma` varies:
+# ## How much does sigma matter?
+# It is the one number chosen by hand. Parameters by either method, and the free-run error on record 2 that they lead to:
 
 # %%
-errors = {
-    name: [rms(free_run(ekf(second, s, p_s, np.zeros(4))[1][WARM, :2], later, p_s) - later[1]) for s, p_s in chosen]
-    for name in ("MHE, whole record", "EKF, last value")
-    for chosen in [[(s, found[name, s]) for s in SIGMAS]]
-}
-figure, axis = plt.subplots(figsize=(6, 3), layout="constrained")
-for (name, values), color, marker in zip(errors.items(), (BLUE, ORANGE), ("o", "s"), strict=True):
-    axis.semilogx(SIGMAS, values, color=color, marker=marker, label=f"p from {name}")
-axis.set(xlabel="sigma [V/√s]", ylabel="free-run RMS [V]")
-axis.set_ylim(bottom=0)
-axis.set_title(SOURCE, loc="left", fontsize=10)
-axis.legend()
-plt.show()
-pd.DataFrame(errors, index=pd.Index(SIGMAS, name="sigma")).round(3)
+rows = {}
+for (who, sigma), p_held in found.items():
+    start = ekf(second, sigma, p_held, np.zeros(4))[1][WARM, :2]
+    error = rms(free_run(start, later, p_held) - later[1])
+    rows[f"p from {who}", sigma] = dict(zip(NAMES, p_held.round(4), strict=True)) | {"free run [V]": round(error, 3)}
+print(SOURCE + "s")
+pd.DataFrame(rows).T.rename_axis(["", "sigma"])
+
+# %% [markdown]
+# What the numbers say:
+# - **Filtering is not where the two differ.** With the same p, MHE and EKF predict one step equally well: the model is nearly
+#   linear over one step, and one sample back the whole past is well summarised by a mean and a covariance.
+# - **Parameters are.** The EKF linearises once, along a trajectory that starts with wrong parameters, and never returns; its last
+#   value depends on sigma. The window re-linearises 68 minutes until they agree, and its p hardly moves.
+# - The free run ends near 0.5 V with either state: what is left is the model. w shows where it lacks something: when tanks
+#   spill, and in two jumps (minutes 24 and 63) that no inflow explains.

@@ -5,7 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
-HEAVY = ("fmpy", "matplotlib", "cvxpy", "scikits_odes_sundials", "joblib", "zarr", "xarray", "pandas", "h5netcdf", "typer", "tqdm")
+HEAVY = ["fmpy", "matplotlib", "cvxpy", "scikits_odes_sundials", "joblib", "zarr", "xarray", "pandas", "h5netcdf"]
+HEAVY += ["typer", "tqdm", "scipy.linalg", "scipy.optimize"]
 
 
 def test_importing_ctmhe_loads_no_heavy_library():

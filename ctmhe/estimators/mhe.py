@@ -20,7 +20,7 @@ from ctmhe.solvers.base import Solution
 from ctmhe.solvers.gauss_newton import GaussNewton
 from ctmhe.solvers.ipopt import Ipopt
 from ctmhe.solvers.ladder import climb
-from ctmhe.transcription.assembly import Assembly, Records
+from ctmhe.transcription.assembly import Assembly, Records, hold_kinds
 from ctmhe.transcription.grid import Mesh
 from ctmhe.transcription.integrators import Integrator, StepMap
 from ctmhe.transcription.problem import Guess, Window, rollout
@@ -167,6 +167,7 @@ class MHE:
         self._reference = Ipopt(self.stage)
         self._solver = self._gauss_newton if solver == "gauss-newton" else self._reference
         self._silent = np.zeros(len(model.w))
+        self.hold = dict(zip(model.y.names, hold_kinds(model, hold), strict=True))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuild, (self._configuration,)

@@ -93,7 +93,7 @@ class Loop:
         if np.isfinite(trigger.longest_wait):
             mhe.check_wait(trigger.longest_wait)
         if self.model.step is None:
-            check_hold(channel, holds_of(mhe), self.model.y.names)
+            check_hold(channel, mhe.hold, self.model.y.names)
         self.y_map = matched(self.model.y, plant.y, "plant", plant.name)
         self.u_map = matched(self.model.u, plant.u, "plant", plant.name)
         self.channel, self.link = channel, channel.open(seed)
@@ -319,12 +319,6 @@ def steps_of(times: Array, progress: bool) -> Any:
     from tqdm import tqdm
 
     return tqdm(range(len(times)), desc="simulating", unit="step", leave=False)
-
-
-def holds_of(mhe: MHE) -> dict[str, str]:
-    """Return how the estimator takes each output: name -> "zero", "linear" or "point"."""
-    rows = zip(mhe.model.y.names, mhe.assembly.held, mhe.assembly.linear, strict=True)
-    return {name: "point" if not held else "linear" if linear else "zero" for name, held, linear in rows}
 
 
 def matched(wanted: Signals, offered: Signals, what: str, name: str) -> Array:

@@ -52,7 +52,7 @@ class FmuPlant:
         `w` ends with a `v_<output>` for each output, which is added to it.
     integrator : str
         What integrates the plant.
-    x_start : array (nx,)
+    x_start, u_start : array (nx,), (nu,)
         The FMU's own start.
     description : Description
 
@@ -99,6 +99,7 @@ class FmuPlant:
             self.integrator = self._engine.method
             self.start(0.0, None)
             self.x_start = frozen(self.state())
+            self.u_start = frozen([variable.start or 0.0 for variable in self._inputs])
         except BaseException:
             self.close()
             raise

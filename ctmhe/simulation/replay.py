@@ -11,7 +11,7 @@ from ctmhe.errors import InputError
 from ctmhe.estimators.mhe import MHE
 from ctmhe.models.signals import Signals
 from ctmhe.simulation.channel import Channel, SingleSample, WholeSignal
-from ctmhe.simulation.engine import Loop, holds_of
+from ctmhe.simulation.engine import Loop
 from ctmhe.simulation.run import Run
 from ctmhe.simulation.signals import Recorded, bind_disturbance
 from ctmhe.triggers.base import Trigger
@@ -137,7 +137,7 @@ def replay(
     plant = RecordedPlant(log, model.y, model.u)
     columns = [log.inputs.index(name) for name in model.u]
     if channel is None:
-        channel = SingleSample() if set(holds_of(mhe).values()) == {"point"} and model.step is None else WholeSignal()
+        channel = SingleSample() if set(mhe.hold.values()) == {"point"} and model.step is None else WholeSignal()
     loop = Loop(
         plant,
         mhe,

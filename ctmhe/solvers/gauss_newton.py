@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from threading import local
 
 import numpy as np
 
@@ -52,15 +53,11 @@ class GaussNewton:
 
     def __init__(self, stage: StageFunction, *, max_iterations: int = 50, tolerance: float = 1e-11):
         self.stage, self.max_iterations, self.tolerance = stage, max_iterations, tolerance
-        self._systems: dict[tuple[bool, bool], KKT] = {}
+        self._scratch = local()  # one set of KKT systems a thread
 
     def solve(self, window: Window, guess: Guess) -> Solution:
         """Return the solution from `guess`; never raises for numerical trouble."""
-        key = (window.output_bounded, window.p_estimated)
-        if key not in self._systems:
-            stage = self.stage
-            self._systems[key] = KKT(stage.nx, stage.nw, stage.ny * key[0], stage.np * key[1])
-        kkt = self._systems[key]
+        kkt = self._system(window)
         floor = 1e-14 * self._data_scale(window)
         factorizations, damping, rho = 0, 0.0, 0.0
         step: Step | None = None
@@ -145,6 +142,16 @@ class GaussNewton:
             factorizations,
             multipliers,
         )
+
+    def _system(self, window: Window) -> KKT:
+        systems: dict[tuple[bool, bool], KKT] | None = getattr(self._scratch, "systems", None)
+        if systems is None:
+            systems = self._scratch.systems = {}
+        key = (window.output_bounded, window.p_estimated)
+        if key not in systems:
+            stage = self.stage
+            systems[key] = KKT(stage.nx, stage.nw, stage.ny * key[0], stage.np * key[1])
+        return systems[key]
 
     def _data_scale(self, window: Window) -> float:
         """Return the cost of explaining nothing, used where the cost itself is zero."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from threading import Lock
 from typing import Any
 
 import casadi as ca
@@ -60,9 +61,14 @@ class Ipopt:
         self.options = OPTIONS | (options or {})
         self.built = 0
         self._programs: dict[bool, _Program] = {}
+        self._lock = Lock()  # statistics belong to the last call: one at a time
 
     def solve(self, window: Window, guess: Guess) -> Solution:
         """Return the solution from `guess`; never raises for numerical trouble."""
+        with self._lock:
+            return self._solve(window, guess)
+
+    def _solve(self, window: Window, guess: Guess) -> Solution:
         n, stage = len(window.mesh), self.stage
         program = self._program(n, window.output_bounded)
         size = program.capacity
@@ -139,7 +145,7 @@ class Ipopt:
             success and feasibility < 1e-6,
             status if success else f"IPOPT: {status}",
             iterations,
-            float("nan"),
+            float(statistics.get("iterations", {}).get("inf_du", [float("nan")])[-1]),
             feasibility,
             iterations,
             Multipliers(dynamics, zx, zw, zy, zp),

@@ -8,9 +8,9 @@ factorises it with partial pivoting in O(N). Constant parameters are a border, e
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 
 import numpy as np
-from scipy.linalg.lapack import dgbtrf, dgbtrs  # pyright: ignore[reportAttributeAccessIssue]
 
 from ctmhe.types import Array
 
@@ -131,6 +131,8 @@ class KKT:
         self.nx, self.nw, self.ny, self.np = nx, nw, ny, n_parameters
         self._layouts = {shared: _Layout(nx, nw, ny, shared) for shared in (False, True)}
         self._storage = np.empty(0)
+        lapack = import_module("scipy.linalg.lapack")  # late: it takes as long to import as CasADi
+        self._factor, self._solve = lapack.dgbtrf, lapack.dgbtrs
 
     def solve(self, qp: QuadraticProgram, active: ActiveSet, *, damping: float = 0.0, max_changes: int = 40) -> Step:
         """Return the minimiser, starting from a guess of the active set.
@@ -270,7 +272,7 @@ class KKT:
             blocks[:, eye["Wm"]] = tied * next_free
             blocks[:, diagonal["m"]] = 1.0 - tied
         band = np.ndarray((rows, total), buffer=flat.data, order="F")
-        factors, pivots, info = dgbtrf(band, layout.band, layout.band, overwrite_ab=1)
+        factors, pivots, info = self._factor(band, layout.band, layout.band, overwrite_ab=1)
         if info != 0:
             raise Singular("the KKT matrix is singular")
         return factors, layout, pivots
@@ -298,7 +300,7 @@ class KKT:
         return rhs
 
     def _back_substitute(self, factors: Array, layout: _Layout, pivots: Array, rhs: Array) -> Array:
-        solution, info = dgbtrs(factors, layout.band, layout.band, rhs, pivots)
+        solution, info = self._solve(factors, layout.band, layout.band, rhs, pivots)
         if info != 0 or not np.isfinite(solution).all():
             raise Singular("the KKT matrix is singular")
         return solution

@@ -68,6 +68,20 @@ def test_estimating_twice_from_one_state_gives_identical_results():
     same(first, mhe.estimate(state, 1.3)[1])
 
 
+@pytest.mark.parametrize("solver", ["gauss-newton", "ipopt"])
+def test_threads_that_share_an_estimator_get_the_same_numbers(solver):
+    """Scratch memory is per thread: concurrent estimates equal sequential ones."""
+    from concurrent.futures import ThreadPoolExecutor
+
+    mhe = oscillator_mhe(hold="point", solver=solver)
+    states = [feed(mhe, mhe.init(x=[1, 0]), TIMES, rows(seed)) for seed in range(8)]
+    expected = [mhe.estimate(state, 1.3)[1] for state in states]
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda state: mhe.estimate(state, 1.3)[1], states * 5))
+    for i, estimate in enumerate(found):
+        same(expected[i % 8], estimate)
+
+
 def test_branches_of_one_state_do_not_see_each_other():
     """Appending to one branch leaves the other without the measurement."""
     mhe = MHES["point"]
@@ -126,14 +140,14 @@ def test_discounting_weighs_the_past_less():
     """With eta = 1 an old outlier pulls the estimate more than with eta = 0.1."""
     pulls = []
     for eta in (1.0, 0.1):
-        mhe = oscillator_mhe(cost=REACTORLESS(eta), hold="point")
+        mhe = oscillator_mhe(cost=oscillator_cost(eta), hold="point")
         clean = feed(mhe, mhe.init(x=[0, 0]), [0.1, 1.9], [[0, 0], [0, 0]])
         dirty = feed(mhe, mhe.init(x=[0, 0]), [0.1, 1.9], [[5, 0], [0, 0]])
         pulls.append(np.abs(mhe.estimate(dirty, 1.9)[1].x - mhe.estimate(clean, 1.9)[1].x).max())
     assert pulls[1] < pulls[0]
 
 
-def REACTORLESS(eta):
+def oscillator_cost(eta):
     """Cost of the oscillator with a given discount."""
     from ctmhe.types import DiscountedCost
 
