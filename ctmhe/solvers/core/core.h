@@ -1,0 +1,105 @@
+/* The structured Gauss-Newton core: one window's problem as plain arrays, solved without a call back into Python.
+ *
+ * All arrays are C-ordered doubles (int8 for active sets, uint8 for flags), laid out as the attributes of
+ * `ctmhe.transcription.problem.Window` and `Guess` with the same names. The core keeps no state between calls: equal
+ * arguments give equal results. Scratch memory is a block that the caller owns, one a thread.
+ *
+ * Sizes are run-time values in the shipped build. Compiled together with a model's stage function, they are constants:
+ * define CTMHE_NX, CTMHE_NW, CTMHE_NP, CTMHE_NY, CTMHE_NQ before including core.c.
+ */
+#ifndef CTMHE_CORE_H
+#define CTMHE_CORE_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define CTMHE_CORE_VERSION 1
+
+/* The stage function over one slot, in CasADi's own calling convention:
+ * arguments t, h, x (nx), w (nw), p (np), u0 (nu), u1 (nu) [, lambda_x (nx), lambda_y (q*ny)]
+ * results of `jacobian`: x_next (nx), y (q*ny), J (nx + q*ny rows, nx + nw + np columns, column-major)
+ * results of `value`: x_next, y;  of `curvature`: H (n x n, n = nx + nw + np) */
+typedef int (*ctmhe_casadi)(const double **arg, double **res, long long *iw, double *w, int mem);
+
+/* CasADi's evaluation buffer (the VM): eval(self) reads and writes memory bound beforehand. */
+typedef void (*ctmhe_buffer_eval)(void *self);
+
+typedef struct {
+  ctmhe_casadi function;      /* compiled function, or NULL */
+  long long *iw;              /* its work vectors */
+  double *w;
+  ctmhe_buffer_eval eval;     /* else the VM's buffer */
+  void *self;
+  const int *failed;          /* set by the VM's wrapper when an evaluation failed; may be NULL */
+  double *arg[9];             /* memory bound to the arguments: the core writes here (VM) or passes these pointers */
+  double *res[3];             /* memory bound to the results */
+} ctmhe_function;
+
+typedef struct {
+  int nx, nw, np, nu, ny, q;  /* np: all parameters of the stage function */
+  int symbolic;               /* `curvature` exists */
+  ctmhe_function value, jacobian, curvature;
+} ctmhe_stage;
+
+typedef struct {
+  int n;                      /* slots N */
+  int p_estimated;            /* 0: p is held at prior[nx:] */
+  int output_bounded;         /* y_lower / y_upper matter */
+  const double *t, *h;        /* (N+1), (N) */
+  const uint8_t *shared;      /* (N): slot k+1 shares the w of slot k */
+  const double *u0, *u1;      /* (N, nu) */
+  const double *prior;        /* (nx + np) */
+  const double *L_prior;      /* (m, m), m = nx or nx + np */
+  const double *L_w;          /* (N, nw, nw) */
+  const double *L_y;          /* (N, q, ny, ny) */
+  const double *y_data;       /* (N, q, ny) */
+  const double *x_lower, *x_upper; /* (N+1, nx) */
+  const double *w_lower, *w_upper; /* (N, nw) */
+  const double *y_lower, *y_upper; /* (N, ny): output at the slot's last evaluation point */
+  const double *p_lower, *p_upper; /* (np) */
+  const double *x_scale, *w_scale, *p_scale, *y_scale;
+} ctmhe_window;
+
+typedef struct {
+  int max_iterations;
+  double tolerance;           /* predicted decrease relative to the cost at which a full step is the last */
+} ctmhe_options;
+
+enum ctmhe_stop {             /* why the core stopped */
+  CTMHE_CONVERGED = 0,
+  CTMHE_ITERATION_LIMIT = 1,
+  CTMHE_NOT_FINITE = 2,       /* the model is not finite at the guess, or failed there */
+  CTMHE_NO_DECREASE = 3,      /* no step decreases the merit function */
+  CTMHE_SINGULAR = 4          /* no consistent set of active bounds, or a direction without curvature */
+};
+
+typedef struct {              /* in and out */
+  double *x;                  /* (N+1, nx): guess in, solution out */
+  double *w;                  /* (N, nw) */
+  double *p;                  /* (np) */
+  int8_t *x_active, *w_active, *y_active, *p_active; /* -1, 0, +1; guess in, set at the solution out */
+  double *y;                  /* (N, q, ny) out */
+  double *dynamics_multiplier;/* (N, nx) out, scaled variables, cost J / 2 */
+  double *x_multiplier, *w_multiplier, *y_multiplier, *p_multiplier; /* out, as the bounds */
+  double cost, optimality, feasibility; /* out; feasibility: scaled defects and bound violations */
+  int stop, iterations, factorizations; /* out */
+} ctmhe_result;
+
+/* Bytes of scratch that a window of n slots needs. */
+size_t ctmhe_scratch_size(const ctmhe_stage *stage, int n);
+
+/* Solve. Returns the stop code, also in result->stop. */
+int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmhe_options *options,
+                ctmhe_result *result, void *scratch);
+
+/* Sizes compiled in (all zero in the shipped build), and the version: a loader refuses what does not fit. */
+void ctmhe_sizes(int *nx, int *nw, int *np, int *ny, int *q, int *version);
+
+#ifdef __cplusplus
+}
+#endif
+#endif
