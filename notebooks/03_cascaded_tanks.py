@@ -13,15 +13,14 @@
 
 # %% [markdown]
 # # Cascaded tanks: real data, a level nobody measures, four unknown parameters
-# A pump fills the upper tank, which drains into the lower one, whose level is measured every 4 s. Both can
-# overflow. One record of 68 minutes serves for estimation, a second one for validation (Schoukens, Mattsson, Wigren and
-# Noël 2016). The upper level appears in neither.
+# A pump fills the upper tank, which drains into the lower one, whose level is measured every 4 s. Both can overflow.
+# One record of 68 minutes serves for estimation, a second one for validation (Schoukens, Mattsson, Wigren and Noël
+# 2016). The upper level appears in neither.
 #
 # 1. One window over the whole first record estimates (x, p) together.
 # 2. On the second record, p is held: how well do MHE and a plain EKF predict one step, and the rest of the record?
 
 # %%
-import time
 from pathlib import Path
 
 import casadi as ca
@@ -50,8 +49,9 @@ print(model)
 
 # %% [markdown]
 # ## Data
-# The records lie outside the repository. Where they are missing, two simulated ones take their place, so that the code
-# below runs; every table and figure names its source.
+# The records lie outside the repository. Where they are missing, two simulated ones take their place, so that the
+# code below runs; every table and figure names its source.
+
 
 # %%
 def rk4(f, x, step, parts=4):
@@ -93,13 +93,15 @@ if file.exists():
 else:
     first, second = simulated(1), simulated(2)
     SOURCE = "SIMULATED STAND-IN, not the benchmark"
-    print("Real data skipped: ../shared/data/cascaded_tanks/dataBenchmark.csv (from the repository's root) is not here.")
+    print(
+        "Real data skipped: ../shared/data/cascaded_tanks/dataBenchmark.csv (from the repository's root) is not here."
+    )
 print(f"{SOURCE}: {len(first[0])} + {len(second[0])} samples, {STEP:g} s apart")
 
 # %% [markdown]
 # ## One window over the whole first record
-# Every weight is an inverse covariance: the sensor's standard deviation is 0.05 V, `sigma` [V/√s] says how far the levels
-# may wander from the model, and the prior is wide (the parameters start at the same round 0.05 ± 0.02).
+# Every weight is an inverse covariance: the sensor's standard deviation is 0.05 V, `sigma` [V/√s] says how far the
+# levels may wander from the model, and the prior is wide (the parameters start at the same round 0.05 ± 0.02).
 # `horizon` exceeds the record, so this is full information estimation: 2048 unknown disturbances, 4 parameters.
 
 # %%
@@ -109,7 +111,9 @@ NOISE, GUESS, SPREAD = 0.05, np.full(4, 0.05), np.full(4, 0.02)
 def tanks_mhe(sigma, horizon, P):
     """P over two states holds the parameters; over two states and four parameters it estimates them."""
     cost = DiscountedCost(P=P, Q=1 / sigma**2, R_point=1 / NOISE**2)
-    return MHE(model, horizon=horizon, interval=STEP, integrator=RK4(step=1.0), cost=cost, bounds=model.bounds, hold="point")
+    return MHE(
+        model, horizon=horizon, interval=STEP, integrator=RK4(step=1.0), cost=cost, bounds=model.bounds, hold="point"
+    )
 
 
 def fit(record, sigma):
@@ -128,8 +132,8 @@ for sigma, estimate in fits.items():
     print(f"sigma {sigma:<6g} {status}; {status.iterations} iterations, {estimate.seconds:.1f} s")
 
 # %% [markdown]
-# The window reconstructs the level that has no sensor, with its uncertainty at the end of the window, and the disturbance shows
-# where the model needs help.
+# The window reconstructs the level that has no sensor, with its uncertainty at the end of the window, and the
+# disturbance shows where the model needs help.
 
 # %%
 best = fits[0.03]
@@ -140,7 +144,13 @@ axes[0].plot(minutes, best.trajectory.x[:, 1], color=BLUE, lw=1, label="lower, e
 axes[1].plot(minutes, best.trajectory.x[:, 0], color=ORANGE, lw=1.2, label="upper, estimated, never measured")
 deviation = np.sqrt(best.covariance[0, 0])
 axes[1].errorbar(
-    minutes[-1], best.x[0], yerr=2 * deviation, color=ORANGE, capsize=4, clip_on=False, label=f"±2 std = ±{2 * deviation:.2f} V"
+    minutes[-1],
+    best.x[0],
+    yerr=2 * deviation,
+    color=ORANGE,
+    capsize=4,
+    clip_on=False,
+    label=f"±2 std = ±{2 * deviation:.2f} V",
 )
 axes[2].plot(minutes[:-1], 1e3 * best.trajectory.w[:, 0], color=ORANGE, lw=0.8, label="w_upper")
 axes[2].plot(minutes[:-1], 1e3 * best.trajectory.w[:, 1], color=BLUE, lw=0.8, label="w_lower")
@@ -195,9 +205,9 @@ found |= {("EKF, last value", sigma): ekf(first, sigma, GUESS, SPREAD)[1][-1, 2:
 
 # %% [markdown]
 # ## The second record
-# p is held at what the first record gave. Both filters run through the record; what they predict for the next sample gives the
-# **one-step** error. After 100 s (25 samples) the measurements stop and the model runs alone to the end: the
-# **free-run** error. MHE: a window of 40 s, prior weight = inverse covariance of the fit above.
+# p is held at what the first record gave. Both filters run through the record; what they predict for the next sample
+# gives the **one-step** error. After 100 s (25 samples) the measurements stop and the model runs alone to the end:
+# the **free-run** error. MHE: a window of 40 s, prior weight = inverse covariance of the fit above.
 
 # %%
 WARM = 25
@@ -267,7 +277,8 @@ plt.show()
 
 # %% [markdown]
 # ## How much does sigma matter?
-# It is the one number chosen by hand. Parameters by either method, and the free-run error on record 2 that they lead to:
+# It is the one number chosen by hand. Parameters by either method, and the free-run error on record 2 that they lead
+# to:
 
 # %%
 rows = {}
@@ -280,9 +291,10 @@ pd.DataFrame(rows).T.rename_axis(["", "sigma"])
 
 # %% [markdown]
 # What the numbers say:
-# - **Filtering is not where the two differ.** With the same p, MHE and EKF predict one step equally well: the model is nearly
-#   linear over one step, and one sample back the whole past is well summarised by a mean and a covariance.
-# - **Parameters are.** The EKF linearises once, along a trajectory that starts with wrong parameters, and never returns; its last
-#   value depends on sigma. The window re-linearises 68 minutes until they agree, and its p hardly moves.
-# - The free run ends near 0.5 V with either state: what is left is the model. w shows where it lacks something: when tanks
-#   spill, and in two jumps (minutes 24 and 63) that no inflow explains.
+# - **Filtering is not where the two differ.** With the same p, MHE and EKF predict one step equally well: the model
+#   is nearly linear over one step, and a mean and a covariance summarise the past well.
+# - **Parameters are.** The EKF linearises once, along a trajectory that starts with wrong parameters, and never
+#   returns; its last value depends on sigma. The window re-linearises 68 minutes until they agree, and its p hardly
+#   moves. (One pass against the whole record at once: iterating or smoothing would narrow the gap.)
+# - The free run ends near 0.5 V with either state: what is left is the model. w shows where it lacks something: when
+#   tanks spill, and in two sudden drops of the lower level (real record 1, minutes 24 and 63).

@@ -57,8 +57,12 @@ class GaussNewton:
 
     def solve(self, window: Window, guess: Guess) -> Solution:
         """Return the solution from `guess`; never raises for numerical trouble."""
+        with np.errstate(all="ignore"):  # a trial step may leave the model's domain: that is judged, not warned of
+            return self._solve(window, guess)
+
+    def _solve(self, window: Window, guess: Guess) -> Solution:
         kkt = self._system(window)
-        floor = 1e-14 * self._data_scale(window)
+        floor = self.stage.accuracy**2 * self._data_scale(window)
         factorizations, damping, rho = 0, 0.0, 0.0
         step: Step | None = None
         optimality = last_decrease = float("nan")
@@ -95,6 +99,9 @@ class GaussNewton:
             rho = max(
                 rho, 1.5 * float(np.abs(step.dynamics).max(initial=0.0)), 1.5 * float(np.abs(step.zy).max(initial=0.0))
             )
+            if self._feasible(current) and _largest(step) <= 100 * self.stage.accuracy:
+                message, success = "converged to the accuracy of the integrator", True
+                break
             trial, alpha = self._line_search(window, current, step, rho, predicted)
             if trial is None and newton:
                 newton, last_decrease = False, float("nan")
@@ -110,13 +117,8 @@ class GaussNewton:
             newton = self.stage.symbolic and alpha == 1.0 and (newton or slow)
             last_decrease = predicted
             current = trial
-            scale = max(current.cost, floor)
-            small = abs(predicted) <= self.tolerance * scale and alpha == 1.0
-            if (
-                small
-                and float(np.abs(current.defect).max(initial=0.0)) <= 1e-8
-                and current.y_excess.max(initial=0.0) <= 1e-8
-            ):
+            small = abs(predicted) <= max(self.tolerance * current.cost, floor) and alpha == 1.0
+            if small and self._feasible(current):
                 message, success = "converged", True
                 break
         point = current.point
@@ -154,10 +156,14 @@ class GaussNewton:
         return systems[key]
 
     def _data_scale(self, window: Window) -> float:
-        """Return the cost of explaining nothing, used where the cost itself is zero."""
+        """Return the cost of explaining nothing: what round-off in the residuals is relative to."""
         data = float(np.sum((window.L_y @ window.y_data[..., None]) ** 2))
         prior = float(np.sum((window.L_prior @ window.prior[: len(window.L_prior)]) ** 2))
         return data + prior + 1e-300
+
+    def _feasible(self, current: _Iterate) -> bool:
+        limit = max(1e-8, 10 * self.stage.accuracy)
+        return max(float(np.abs(v).max(initial=0.0)) for v in (current.defect, current.y_excess)) <= limit
 
     def _y_end(self, current: _Iterate) -> Array:
         return current.linear.y[:, -1]
@@ -329,6 +335,11 @@ class GaussNewton:
 
 def _parts(active: ActiveSet) -> tuple[np.ndarray, ...]:
     return active.x, active.w, active.y, active.p
+
+
+def _largest(step: Step) -> float:
+    """Return the largest component of a step, relative to the signals' scales."""
+    return max(float(np.abs(part).max(initial=0.0)) for part in (step.dx, step.dw, step.dp))
 
 
 def _typical_curvature(qp: QuadraticProgram) -> float:

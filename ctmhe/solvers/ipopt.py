@@ -26,7 +26,7 @@ OPTIONS: dict[str, Any] = {
     "ipopt.compl_inf_tol": 1e-10,
     "ipopt.acceptable_iter": 0,
     "ipopt.bound_relax_factor": 0.0,
-    "ipopt.max_iter": 500,
+    "ipopt.max_iter": 200,
     "show_eval_warnings": False,
 }
 

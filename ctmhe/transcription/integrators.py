@@ -13,14 +13,23 @@ from ctmhe.models.continuous import Model
 from ctmhe.types import Array
 
 
+ROUND_OFF = 1e-14
+
+
 class Integrator(Protocol):
     """Carries the state over one slot and visits the nodes of the output integral.
 
     `nodes` and `weights` are the quadrature of the slot [0, 1]: the integral of g is the sum of weights * g(nodes).
+    `accuracy` is how finely results respond to arguments, relative: what a solver cannot ask beyond.
     """
 
     nodes: Array
     weights: Array
+
+    @property
+    def accuracy(self) -> float:
+        """Relative accuracy of an evaluation: round-off, or the tolerance of an adaptive method."""
+        ...
 
     def parts(self, interval: float) -> int:
         """Return into how many equal steps a cell of `interval` seconds is divided."""
@@ -62,6 +71,7 @@ class RK4:
 
     nodes = np.array([0.0, 0.5, 0.5, 1.0])
     weights = np.array([1.0, 2.0, 2.0, 1.0]) / 6.0
+    accuracy = ROUND_OFF
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.step) and self.step > 0):
@@ -109,6 +119,11 @@ class CVODES:
     nodes = np.array([0.5 - np.sqrt(0.15), 0.5, 0.5 + np.sqrt(0.15)])
     weights = np.array([5.0, 8.0, 5.0]) / 18.0
 
+    @property
+    def accuracy(self) -> float:
+        """Return `rtol`."""
+        return self.rtol
+
     def __post_init__(self) -> None:
         for name in ("rtol", "atol"):
             value = getattr(self, name)
@@ -147,6 +162,7 @@ class StepMap:
 
     nodes = np.empty(0)
     weights = np.empty(0)
+    accuracy = ROUND_OFF
 
     def parts(self, interval: float) -> int:
         """Return 1: a cell is a step."""

@@ -45,6 +45,8 @@ class StageFunction:
     ----------
     nodes, weights : array (q - 1,)
         Quadrature of a slot (empty unless `signal`); the end follows as the last of the q outputs.
+    accuracy : float
+        Relative accuracy of an evaluation.
     value, derivative : casadi.Function
         (t, h, x, w, p, u0, u1) -> (x_next, vec y), and the same with the Jacobian as a third result.
     symbolic : bool
@@ -55,6 +57,7 @@ class StageFunction:
         self.nx, self.nw, self.np, self.nu, self.ny = (len(getattr(model, key)) for key in "xwpuy")
         self.nodes = integrator.nodes if signal else np.empty(0)
         self.weights = integrator.weights if signal else np.empty(0)
+        self.accuracy = integrator.accuracy
         slot = integrator.trace(model, signal)
         self.q = slot.size2_out(1)
         symbolic = slot.is_a("SXFunction")

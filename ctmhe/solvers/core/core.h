@@ -18,6 +18,7 @@ extern "C" {
 #endif
 
 #define CTMHE_CORE_VERSION 1
+#define CTMHE_MAX_ARGUMENTS 64 /* pointers a compiled stage function may use (CasADi's sz_arg, sz_res) */
 
 /* The stage function over one slot, in CasADi's own calling convention:
  * arguments t, h, x (nx), w (nw), p (np), u0 (nu), u1 (nu) [, lambda_x (nx), lambda_y (q*ny)]

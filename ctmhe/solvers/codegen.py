@@ -1,0 +1,167 @@
+"""Compiles the core into shared libraries, once each: alone, or with a model's stage function and its sizes."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from contextlib import suppress
+from functools import cache
+from hashlib import sha256
+from importlib.metadata import PackageNotFoundError, distribution
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+
+from ctmhe.errors import SolverError
+from ctmhe.solvers.compilers import Source, build_library, extra_flags, find_compiler
+from ctmhe.transcription.stage import StageFunction
+
+logger = logging.getLogger(__name__)
+
+CORE = Path(__file__).parent / "core"
+LARGE = 10_000  # instructions of a function from which compiling with -O3 takes longer than it is worth
+
+# CasADi functions that become plain C without memory of their own; others call libraries or Python
+GENERATED = frozenset({
+    "SXFunction",
+    "MXFunction",
+    "Map",
+    "MapSum",
+    "Switch",
+    "BSplineInterpolant",
+    "LinearInterpolant",
+    "LinearInterpolantJac",
+})  # fmt: skip
+
+
+def core_digest() -> str:
+    """Return what identifies the core's sources: a line `name sha256` each, as the package's build writes it."""
+    files = sorted([*CORE.glob("*.c"), *CORE.glob("*.h")], key=lambda file: file.name)
+    return "".join(f"{file.name} {sha256(file.read_bytes()).hexdigest()}\n" for file in files)
+
+
+def shipped_core() -> Path | None:
+    """Return the library of the core for any sizes, or None when there is none and nothing to compile it with.
+
+    This is the library that the package's build put beside the core's sources, if it was built from the sources that
+    are there now (an editable install outlives changes to them) and `$CTMHE_CFLAGS` asks for no build of its own; else
+    one that is compiled now and cached.
+    """
+    digest = core_digest()
+    if not extra_flags():
+        for folder in _install_folders():
+            library = _built_from(folder, digest)
+            if library is not None:
+                return library
+    source = CORE / "core.c"
+    if not source.is_file():
+        return None
+    return _compiled("core", [Source("core.c", source.read_text())], digest)
+
+
+def specialised_core(stage: StageFunction) -> Path | None:
+    """Return a library of the core and the stage function, with the sizes as constants, compiled at most once.
+
+    It exports what the core exports and `ctmhe_stage_value`, `ctmhe_stage_jacobian` and, for symbolic models,
+    `ctmhe_stage_curvature`, in CasADi's calling convention and each with its `_work`. The result is cached under what
+    determines it: the functions, the sizes, the core's sources, the compiler, its flags and CasADi's version; code is
+    generated only when it is not found.
+
+    Returns
+    -------
+    Path or None
+        None, with a logged reason, when there is no compiler, compiling fails, or the stage function is more than
+        plain C: CVODES, FMUs, callbacks.
+    """
+    functions = {"value": stage.value, "jacobian": stage.derivative}
+    if stage.symbolic:
+        functions["curvature"] = stage.mapped[2][1]
+    for function in functions.values():
+        reason = _not_generated(function)
+        if reason is not None:
+            logger.info("the stage function is not compiled, %s: it runs in CasADi's virtual machine", reason)
+            return None
+    if not (CORE / "core.c").is_file():
+        return None
+    sizes = {"NX": stage.nx, "NW": stage.nw, "NP": stage.np, "NU": stage.nu, "NY": stage.ny, "NQ": stage.q}
+    digest = sha256(f"{core_digest()}{ca.CasadiMeta.version()}\n{LARGE}\n".encode())
+    for name, function in functions.items():
+        digest.update(f"{name}\n{function.serialize()}\n".encode())
+
+    def sources() -> list[Source]:
+        return [*_generate(functions), Source("core.c", (CORE / "core.c").read_text())]
+
+    return _compiled("stage", sources, digest.hexdigest(), {f"CTMHE_{name}": size for name, size in sizes.items()})
+
+
+def _compiled(name: str, sources: Any, identity: str, defines: dict[str, int] | None = None) -> Path | None:
+    """Build a library, or return None; the reason is logged once, where it arises."""
+    if find_compiler() is None:
+        return None
+    try:
+        return build_library(name, sources, identity=identity, defines=defines or {}, include=[CORE])
+    except SolverError:
+        return None
+
+
+# ---- the library that came with the package ------------------------------------------------------------------------
+
+
+@cache
+def _install_folders() -> tuple[Path, ...]:
+    """Return where the core's library may lie: beside the sources, or where an editable install puts it."""
+    folders = [CORE]
+    with suppress(PackageNotFoundError):  # not installed: running from a source tree
+        folders.append(Path(str(distribution("ctmhe").locate_file("ctmhe/solvers/core"))))
+    return tuple(folders)
+
+
+def _built_from(folder: Path, digest: str) -> Path | None:
+    """Return the library in a folder if it was built from the sources with this digest."""
+    try:
+        if (folder / "_core.sources").read_text() != digest:
+            return None
+    except OSError:
+        return None
+    candidates = (folder / f"_core{suffix}" for suffix in (".so", ".dll", ".dylib"))
+    return next((library for library in candidates if library.is_file()), None)
+
+
+# ---- generated code ------------------------------------------------------------------------------------------------
+
+
+def _not_generated(function: ca.Function) -> str | None:
+    """Return why a function does not become plain C, or None."""
+    for part in (function, *function.find_functions()):
+        if part.class_name() not in GENERATED:
+            return f"it contains the {part.class_name()} '{part.name()}'"
+    return None
+
+
+def _generate(functions: dict[str, ca.Function]) -> list[Source]:
+    """Return the C of the functions, named ctmhe_stage_<key>.
+
+    Curvature is a unit of its own: compiling it with -O3 takes twice as long as with -O1 and makes it no faster.
+    """
+    curvature = [key for key in functions if key == "curvature"]
+    rest = [key for key in functions if key != "curvature"]
+    sources = []
+    for name, keys in (("curvature.c", curvature), ("stage.c", rest)):
+        if keys:
+            large = max(functions[key].n_instructions() for key in keys) > LARGE
+            flags = ("-O1",) if large or keys == curvature else ()
+            sources.append(Source(name, _code(name, (_renamed(functions[key], key) for key in keys)), flags))
+    return sources
+
+
+def _code(name: str, functions: Iterable[ca.Function]) -> str:
+    generator = ca.CodeGenerator(name)
+    for function in functions:
+        generator.add(function)
+    return generator.dump()
+
+
+def _renamed(function: ca.Function, key: str) -> ca.Function:
+    symbols: Any = function.sx_in() if function.is_a("SXFunction") else function.mx_in()
+    return ca.Function(f"ctmhe_stage_{key}", symbols, function.call(symbols, True, False))
