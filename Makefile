@@ -24,8 +24,11 @@ notebooks: .venv/.ready-test  ## rewrite notebooks/*.ipynb from their .py and ru
 	$(bin)/jupytext --quiet --update --to ipynb notebooks/*.py
 	$(bin)/python -m pytest --nbmake --overwrite -W default notebooks/*.ipynb
 
-bench: .venv/.ready-test  ## run the timings in benchmarks/
-	@for file in benchmarks/[a-z]*.py; do echo "== $$file"; $(bin)/python "$$file" || exit 1; done
+bench: .venv/.ready-test  ## time ctmhe and its peers; rows in results/benchmarks.json
+	mkdir -p results
+	$(bin)/python -m benchmarks.solvers --json results/benchmarks.json
+	$(bin)/python -m benchmarks.profile_update
+	$(bin)/python -m benchmarks.stiff
 
 clean:  ## remove what tests, linters and the demo leave behind
 	rm -rf demo build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache fmus/_build
@@ -34,5 +37,5 @@ clean:  ## remove what tests, linters and the demo leave behind
 distclean: clean  ## the same, and .venv
 	rm -rf .venv
 
-.venv/.ready-%: pyproject.toml tools/setup.sh
+.venv/.ready-%: pyproject.toml CMakeLists.txt tools/setup.sh
 	tools/setup.sh $*

@@ -1,8 +1,8 @@
 """Timings of ctmhe and its peers on problems that every tool is given alike.
 
-    python -m benchmarks.solvers --json results.json    every tool on every problem
-    python -m benchmarks.profile_update                 where one update of ctmhe spends its time
-    python -m benchmarks.report results.json            docs/benchmarks.md and its plots
+python -m benchmarks.solvers --json results.json    every tool on every problem
+python -m benchmarks.profile_update                 where one update of ctmhe spends its time
+python -m benchmarks.report results.json            docs/benchmarks.md and its plots
 """
 
 import os

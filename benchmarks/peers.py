@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -117,9 +115,7 @@ def program(problem: Problem, *, augmented: bool) -> Program:
     x = kind.sym("x0", nx + inside)
     decisions, gaps, residuals = [x], [], []
     lower, upper = [x_low], [x_high]
-    residuals.append(
-        np.sqrt(problem.prior_factor) * ca.mtimes(roots["P"], ca.vertcat(x[:nx], x[nx:], tail) - prior)
-    )
+    residuals.append(np.sqrt(problem.prior_factor) * ca.mtimes(roots["P"], ca.vertcat(x[:nx], x[nx:], tail) - prior))
     for i in range(n):
         w = kind.sym(f"w{i}", nw)
         p = x[nx:] if augmented else tail
@@ -189,7 +185,7 @@ QUIET = {"print_time": False, "error_on_fail": False}
 IPOPT = {**QUIET, "ipopt.print_level": 0, "ipopt.sb": "yes"}
 SQP = {
     **QUIET, "print_header": False, "print_iteration": False, "print_status": False, "max_iter": 50,
-    "tol_pr": 1e-6, "tol_du": 1e-4, "show_eval_warnings": False,
+    "tol_pr": 1e-6, "tol_du": 1e-4, "min_step_size": 0.0, "show_eval_warnings": False,
 }  # fmt: skip
 ONE_STEP = {"max_iter": 1, "max_iter_ls": 0}
 RECIPES = {
@@ -306,21 +302,21 @@ class DoMpc:
     def __init__(self, problem: Problem, reference: Reference):
         if not problem.steps:
             raise Unavailable("integrates by collocation, not by CVODES: another problem")
-        try:
-            with warnings.catch_warnings(), suppress(ModuleNotFoundError):
-                warnings.simplefilter("ignore")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
                 import do_mpc  # pyright: ignore[reportMissingImports]
+            except ImportError:
+                raise Unavailable("not installed") from None
             self._setup(do_mpc, problem, reference)
-        except UnboundLocalError:
-            raise Unavailable("not installed") from None
 
     def _setup(self, do_mpc: Any, problem: Problem, reference: Reference) -> None:
         self.problem, self.reference = problem, reference
         model = do_mpc.model.Model("discrete", "SX")
-        nx, nw, ny, npar, nu = (len(getattr(problem.model, key)) for key in "xwypu")
+        nx, nw, npar, nu = (len(getattr(problem.model, key)) for key in "xwpu")
         x, w = model.set_variable("_x", "x", (nx, 1)), model.set_variable("_u", "w", (nw, 1))
         p = model.set_variable("_p", "p", (npar, 1)) if npar else ca.SX(0, 1)
-        prior = model.set_variable("_p", "prior", (nx + npar, 1))
+        model.set_variable("_p", "prior", (nx + npar, 1))
         factor = model.set_variable("_tvp", "factor", (2, 1))
         u = model.set_variable("_tvp", "u", (nu, 1)) if nu else ca.SX(0, 1)
         x_next, _ = problem.step(x, w, p, u)
@@ -353,9 +349,8 @@ class DoMpc:
         self.pending = self.kept
 
     def _feed(self, mhe: Any, nu: int) -> None:
-        problem, npar = self.problem, len(self.problem.model.p)
+        problem = self.problem
         parameters, varying, measured = mhe.get_p_template(), mhe.get_tvp_template(), mhe.get_y_template()
-        del npar
         for i in range(problem.count):
             varying["_tvp", i, "factor"] = [problem.w_factors[i], problem.y_factors[i]]
         self.window = 0
@@ -438,5 +433,3 @@ def loosest(recipe: Recipe, made: Program, problem: Problem, reference: Referenc
     assert tool is not None
     tool.restart()
     return tool
-
-

@@ -220,7 +220,7 @@ def copter(name: str, updates: int, *, count: int = 30, tight: bool = False) -> 
         box = box_of(model, phi=(-0.2, 0.2), theta=(-0.2, 0.2), s1=(-0.7, 0.7))
     else:
         sides = dict.fromkeys(("phi", "theta", "psi"), (-np.pi / 6, np.pi / 6)) | dict.fromkeys(
-            ("O1", "O2", "O3"), (-1.2, 1.2)
+            ("O1", "O2", "O3"), (-1.15, 1.15)
         )
         box = box_of(model, **sides)
     return Problem(

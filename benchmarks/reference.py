@@ -1,4 +1,4 @@
-"""What every tool of one problem starts from and is judged by: the priors, the first window, the cost of each update."""
+"""What every tool starts from and is judged by: the priors, the first window, the cost of each update."""
 
 from __future__ import annotations
 

@@ -20,7 +20,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from benchmarks.peers import AGREEMENT, CONVERGED, ONE, TOOLS, Tool, Unavailable, Update, make_tool
@@ -180,8 +179,8 @@ def machine() -> dict[str, Any]:
     if info.exists():
         names = [line.partition(":")[2].strip() for line in info.read_text().splitlines() if "model name" in line]
         model = names[0] if names else model
-    versions = {"python": platform.python_version(), "casadi": ca.__version__, "numpy": np.__version__}
-    for package in ("ctmhe", "do-mpc"):
+    versions = {"python": platform.python_version(), "numpy": np.__version__}
+    for package in ("ctmhe", "casadi", "do-mpc"):
         try:
             versions[package] = version(package)
         except PackageNotFoundError:

@@ -24,6 +24,29 @@ def frozen(values: Any) -> Array:
     return array
 
 
+def positive(what: str, value: Any, unit: str = "") -> float:
+    """Return `value` as a positive finite float, or raise `InputError` naming `what`."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = float("nan")
+    if not (np.isfinite(number) and number > 0):
+        raise InputError(f"{what} must be a positive number{f' of {unit}' if unit else ''}, got {value!r}")
+    return number
+
+
+def _vector(values: Any, what: str) -> Any:
+    """Return values as a read-only vector, mappings unchanged; anything that is not numeric raises."""
+    if isinstance(values, Mapping):
+        return values
+    try:
+        if values is None:
+            raise TypeError
+        return frozen(np.atleast_1d(np.asarray(values, dtype=np.float64)))
+    except (TypeError, ValueError):
+        raise InputError(f"{what}: values must be numbers or a mapping from names to numbers, got {values!r}") from None
+
+
 def finite_time(t: Any, what: str) -> float:
     """Return `t` as a float, or raise `InputError` when it is not a finite number of seconds."""
     try:
@@ -53,8 +76,7 @@ class Measurement:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "t", finite_time(self.t, "Measurement"))
-        if not isinstance(self.y, Mapping):
-            object.__setattr__(self, "y", frozen(np.atleast_1d(np.asarray(self.y, dtype=np.float64))))
+        object.__setattr__(self, "y", _vector(self.y, f"Measurement at t = {self.t:g}"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +96,7 @@ class Input:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "t", finite_time(self.t, "Input"))
-        if not isinstance(self.u, Mapping):
-            object.__setattr__(self, "u", frozen(np.atleast_1d(np.asarray(self.u, dtype=np.float64))))
+        object.__setattr__(self, "u", _vector(self.u, f"Input at t = {self.t:g}"))
 
 
 Box = tuple[ArrayLike, ArrayLike] | Mapping[str, tuple[float, float]] | None
@@ -152,6 +173,10 @@ class DiscountedCost:
     def __post_init__(self) -> None:
         if self.eta is not None and self.rate is not None:
             raise InputError("DiscountedCost: give eta or rate (kappa = -ln eta), not both")
+        for name in ("eta", "rate", "prior_eta"):
+            value = getattr(self, name)
+            if value is not None and not (isinstance(value, (int, float, np.floating)) and not isinstance(value, bool)):
+                raise InputError(f"DiscountedCost: {name} must be a number, got {value!r}")
         if self.rate is not None:
             if not (np.isfinite(self.rate) and self.rate >= 0):
                 raise InputError(f"DiscountedCost: rate must be finite and >= 0 per second, got {self.rate}")
@@ -282,6 +307,10 @@ class Estimate:
     status: Status
     seconds: float = field(compare=False, default=float("nan"))
     _covariance: Callable[[], tuple[Array, int]] | None = field(default=None, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle the numbers; the covariance, which would need the window's functions, stays behind."""
+        return self.__dict__ | {"_covariance": None}
 
     @cached_property
     def _covariance_and_rank(self) -> tuple[Array, int]:

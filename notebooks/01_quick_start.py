@@ -42,6 +42,7 @@ from fmus.build import build
 plt.rcParams["figure.dpi"] = 80
 fmu = build("batch_reactor")  # compiled for this machine; your own .fmu works the same way
 model = FmuModel(fmu, inputs=[])  # no known input; a disturbance w is added to each derivative
+plant = FmuPlant(fmu, inputs=[])
 print(model)
 
 # %% [markdown]
@@ -80,7 +81,7 @@ disturbance = {
 def run_with(trigger, seed=7):
     """The seed fixes disturbance and noise, whatever the trigger does."""
     return simulate(
-        FmuPlant(fmu, inputs=[]),
+        plant,
         mhe,
         trigger=trigger,
         until=8.0,

@@ -71,15 +71,15 @@ x, u, p = ca.MX.sym("x", 2), ca.MX.sym("u"), ca.MX.sym("p", 4)
 advance = ca.Function("advance", [x, u, p], [rk4(lambda z: model.dynamics(0, z, u, [0, 0], p), x, STEP)])
 
 
-def simulated(seed, n=1024):
-    """A stand-in record: the same model with parameters of its own, disturbed, sensor limited to 10 V."""
+def simulated(seed, n=256):
+    """A short stand-in record: the same model with parameters of its own, disturbed."""
     rng = np.random.default_rng(seed)
-    pump = np.clip(2.8 + np.interp(np.arange(n), np.arange(0, n + 40, 40), rng.normal(0, 1.2, n // 40 + 2)), 0.8, 6.5)
+    k = np.arange(n)
+    pump = 2.8 + 0.8 * np.sin(k / 40 + rng.uniform(0, 6)) + 0.7 * np.sin(k / 17 + rng.uniform(0, 6))
     level, at = np.empty(n), np.array([5.0, 5.0])
-    for k in range(n):
-        level[k] = min(at[1] + rng.normal(0, 0.03), 10.0)
-        at = np.asarray(advance(at, pump[k], [0.048, 0.045, 0.046, 0.042])).ravel() + rng.normal(0, 0.03, 2)
-        at = np.maximum(at, 0.0)
+    for i in k:
+        level[i] = at[1] + rng.normal(0, 0.03)
+        at = np.asarray(advance(at, pump[i], [0.048, 0.045, 0.046, 0.042])).ravel() + rng.normal(0, 0.02, 2)
     return pump, level
 
 
@@ -112,7 +112,14 @@ def tanks_mhe(sigma, horizon, P):
     """P over two states holds the parameters; over two states and four parameters it estimates them."""
     cost = DiscountedCost(P=P, Q=1 / sigma**2, R_point=1 / NOISE**2)
     return MHE(
-        model, horizon=horizon, interval=STEP, integrator=RK4(step=1.0), cost=cost, bounds=model.bounds, hold="point"
+        model,
+        horizon=horizon,
+        interval=STEP,
+        integrator=RK4(step=1.0),
+        cost=cost,
+        bounds=model.bounds,
+        hold="point",
+        max_iterations=200,
     )
 
 
@@ -157,10 +164,9 @@ axes[2].plot(minutes[:-1], 1e3 * best.trajectory.w[:, 1], color=BLUE, lw=0.8, la
 for axis in axes[:2]:
     axis.axhline(10.0, color="#999999", lw=0.8, ls="--")
     axis.set(ylabel="level [V]", ylim=(0, 11.5))
-axes[2].set(ylabel="disturbance [mV/s]", xlabel="time [min]")
+axes[2].set(ylabel="disturbance [mV/s]", xlabel=f"time [min], {SOURCE.lower()} 1 (dashed: rim)")
 for axis in axes:
     axis.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=2, borderaxespad=0.1)
-axes[0].set_title(f"{SOURCE} 1; dashed: rim", loc="left", fontsize=10)
 axes[0].set_xlim(0, minutes[-1])
 plt.show()
 
@@ -270,9 +276,8 @@ for (who, curve), color, style in zip(curves.items(), (ORANGE, BLUE, "#999999"),
     axes[0].plot(minutes, curve, color=color, ls=style, lw=1.2, label=who)
     axes[1].plot(minutes, curve - later[1], color=color, ls=style, lw=1.2)
 axes[0].set(ylabel="lower level [V]", xlim=(minutes[0], minutes[-1]))
-axes[0].set_title(f"{SOURCE} 2, free run", loc="left", fontsize=10)
 axes[0].legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=4, borderaxespad=0.1)
-axes[1].set(ylabel="error [V]", xlabel="time [min]", ylim=(-2.5, 2.5))
+axes[1].set(ylabel="error [V]", xlabel=f"time [min], free run on {SOURCE.lower()} 2", ylim=(-2.5, 2.5))
 plt.show()
 
 # %% [markdown]

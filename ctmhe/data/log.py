@@ -43,6 +43,9 @@ class Log:
         """Build from ordered times (n,) and rows (n, width)."""
         return cls(width, _Shared([float(t) for t in times], [frozen(row) for row in rows]), 0, len(times))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Log.of, (*self.arrays(), self.width)
+
     def __len__(self) -> int:
         return self._stop - self._start
 
@@ -51,10 +54,12 @@ class Log:
         """Time of the newest row, -inf when empty."""
         return self._shared.times[self._stop - 1] if len(self) else -np.inf
 
-    def find(self, t: float) -> Array | None:
-        """Return the row at exactly `t`, or None."""
-        i = bisect_left(self._shared.times, t, self._start, self._stop)
-        return self._shared.rows[i] if i < self._stop and self._shared.times[i] == t else None
+    def find(self, t: float, tolerance: float = 0.0) -> tuple[float, Array] | None:
+        """Return time and row of the first entry within `tolerance` seconds of `t`, or None."""
+        i = bisect_left(self._shared.times, t - tolerance, self._start, self._stop)
+        if i < self._stop and self._shared.times[i] <= t + tolerance:
+            return self._shared.times[i], self._shared.rows[i]
+        return None
 
     def put(self, t: float, row: Array) -> Log:
         """Return a log that also holds `row` at `t`, in place of a row at exactly the same time."""
@@ -84,9 +89,9 @@ class Log:
             return Log(self.width, shared, 0, len(shared.times))
         return Log(self.width, self._shared, start, self._stop)
 
-    def arrays(self, until: float = np.inf) -> tuple[Array, Array]:
-        """Return times (n,) and rows (n, width) up to and including `until`."""
-        stop = bisect_right(self._shared.times, until, self._start, self._stop)
+    def arrays(self, until: float = np.inf, *, beyond: int = 0) -> tuple[Array, Array]:
+        """Return times (n,) and rows (n, width) up to and including `until`, and `beyond` rows after it."""
+        stop = min(bisect_right(self._shared.times, until, self._start, self._stop) + beyond, self._stop)
         times = np.array(self._shared.times[self._start : stop])
         rows = self._shared.rows[self._start : stop]
         return times, np.array(rows) if rows else np.empty((0, self.width))

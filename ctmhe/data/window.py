@@ -42,9 +42,8 @@ def held_signal(
     limit : float
         Seconds for which a sample is held (or interpolated from) when no newer one has come.
     """
-    known = np.zeros(at.shape, dtype=bool)
     if not len(times):
-        return np.zeros(at.shape), known
+        return np.zeros(at.shape), np.zeros(at.shape, dtype=bool)
     i = np.searchsorted(times, slot_start + tolerance, side="right") - 1
     before = i >= 0
     i = np.maximum(i, 0)
@@ -54,8 +53,9 @@ def held_signal(
         span = times[j] - times[i]
         slope = np.where(span > 0, (values[j] - values[i]) / np.where(span > 0, span, 1.0), 0.0)
         value = value + slope[:, None] * (at - times[i][:, None])
-    known = before[:, None] & (at - times[i][:, None] <= limit + tolerance)
-    return np.where(known, value, 0.0), known
+    middle = (slot_start + at[:, -1]) / 2  # slots do not straddle an expiry either: the middle decides
+    known = np.broadcast_to((before & (middle - times[i] <= limit))[:, None], at.shape)
+    return np.where(known, value, 0.0), known.copy()
 
 
 def point_rows(times: Array, edges: Array, tolerance: float) -> tuple[Array, Array]:

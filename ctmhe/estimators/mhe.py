@@ -13,7 +13,7 @@ from ctmhe.data.log import Log
 from ctmhe.data.window import held_inputs
 from ctmhe.errors import InputError, NotEstimated, TooLate
 from ctmhe.estimators.priors import Piece, filtering_prior, trajectory_at
-from ctmhe.estimators.state import State, load_state, save_state
+from ctmhe.estimators.state import State, frozen_set, load_state, save_state
 from ctmhe.models.continuous import Model
 from ctmhe.models.signals import Signals
 from ctmhe.solvers.base import Solution
@@ -21,7 +21,7 @@ from ctmhe.solvers.gauss_newton import GaussNewton
 from ctmhe.solvers.ipopt import Ipopt
 from ctmhe.solvers.ladder import climb
 from ctmhe.transcription.assembly import Assembly, Records, hold_kinds
-from ctmhe.transcription.grid import Mesh
+from ctmhe.transcription.grid import Mesh, same_time
 from ctmhe.transcription.integrators import Integrator, StepMap
 from ctmhe.transcription.problem import Guess, Window, rollout
 from ctmhe.transcription.stage import StageFunction
@@ -37,6 +37,7 @@ from ctmhe.types import (
     Trajectory,
     finite_time,
     frozen,
+    positive,
 )
 
 SOLVERS = ("gauss-newton", "ipopt")
@@ -125,7 +126,13 @@ class MHE:
         given = locals()
         self._configuration: dict[str, Any] = {key: given[key] for key in given if key not in ("self", "__class__")}
         self.model, self.clock = model, clock
-        self.horizon = _positive("horizon", horizon)
+        if not isinstance(model, Model):
+            raise InputError(f"model must be a ContinuousModel, DiscreteModel or FmuModel, got {type(model).__name__}")
+        if bounds is not None and not isinstance(bounds, Bounds):
+            raise InputError(f"bounds must be a Bounds(x=..., w=..., p=..., y=..., residual=...), got {bounds!r}")
+        if not (isinstance(max_iterations, int) and max_iterations > 0):
+            raise InputError(f"max_iterations must be a positive integer, got {max_iterations!r}")
+        self.horizon = positive("horizon", horizon, "seconds")
         if model.step is not None:
             if integrator is not None:
                 raise InputError("integrator: a DiscreteModel has its own step map; leave the integrator out")
@@ -134,7 +141,9 @@ class MHE:
             integrator, interval = StepMap(), model.step
         elif integrator is None or interval is None:
             raise InputError("a ContinuousModel needs interval= (seconds) and integrator=RK4(step=...) or CVODES(...)")
-        self.interval = _positive("interval", interval)
+        elif isinstance(integrator, type) or not isinstance(integrator, Integrator):
+            raise InputError(f"integrator must be RK4(step=...) or CVODES(rtol=..., atol=...), got {integrator!r}")
+        self.interval = positive("interval", interval, "seconds")
         if self.interval > self.horizon * (1 + 1e-9):
             raise InputError(f"interval {self.interval:g} s is longer than the horizon {self.horizon:g} s")
         self.integrator = integrator
@@ -144,12 +153,12 @@ class MHE:
         self.cost = cost
         self.longest_wait = longest_wait
         if longest_wait is not None:
-            self.check_wait(longest_wait)
+            self.check_wait(positive("longest_wait", longest_wait, "seconds"))
         if solver not in SOLVERS:
             raise InputError(f"solver must be one of {', '.join(SOLVERS)}, got {solver!r}")
-        self.hold_limit = self.horizon if hold_limit is None else _positive("hold_limit", hold_limit)
-        kinds = [hold] if isinstance(hold, str) or hold is None else list(dict(hold).values())
-        signal = model.step is None and (any(kind != "point" for kind in kinds) or len(kinds) < len(model.y))
+        self.hold_limit = self.horizon if hold_limit is None else positive("hold_limit", hold_limit, "seconds")
+        self.hold = dict(zip(model.y.names, hold_kinds(model, hold), strict=True))
+        signal = any(kind != "point" for kind in self.hold.values())
         self.stage = StageFunction(model, integrator, signal=signal)
         self.assembly = Assembly(
             model,
@@ -167,7 +176,6 @@ class MHE:
         self._reference = Ipopt(self.stage)
         self._solver = self._gauss_newton if solver == "gauss-newton" else self._reference
         self._silent = np.zeros(len(model.w))
-        self.hold = dict(zip(model.y.names, hold_kinds(model, hold), strict=True))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuild, (self._configuration,)
@@ -223,14 +231,18 @@ class MHE:
         InputError
             For wrong shapes, unknown names, infinite values, or a sensor that says two different things at one time.
         """
+        state = _checked(state, self)
+        if not isinstance(measurement, Measurement):
+            raise InputError(f"observe expects a Measurement(t, y), got {type(measurement).__name__}")
         t = measurement.t
         row = self.model.y.vector(measurement.y, f"measurement at t = {t:g}", missing=np.nan, allow_nan=True)
-        self._check_age(state, t, "measurement", state.t - self.horizon)
+        self._check_age(state, t, "measurement")
         if not np.isfinite(row).any():
             return state
         self._check_step(t, "measurement")
-        known = state.measurements.find(t)
-        if known is not None:
+        found = state.measurements.find(t, self._slack(t))
+        if found is not None:
+            t, known = found
             conflict = np.isfinite(known) & np.isfinite(row) & (known != row)
             if conflict.any():
                 i = int(np.flatnonzero(conflict)[0])
@@ -244,14 +256,23 @@ class MHE:
 
     def control(self, state: State, value: Input) -> State:
         """Return the state that also knows the input from `value.t` on; at one time the last one given counts."""
+        state = _checked(state, self)
+        if not isinstance(value, Input):
+            raise InputError(f"control expects an Input(t, u), got {type(value).__name__}")
         u = self.model.u.vector(value.u, f"input at t = {value.t:g}")
         if state.solves:
-            self._check_age(state, value.t, "input", state.t - self.horizon)
+            self._check_age(state, value.t, "input")
         return replace(state, inputs=state.inputs.put(value.t, u))
 
-    def _check_age(self, state: State, t: float, what: str, window: float) -> None:
-        edge = max(state.t0, window)
-        if t < edge - 1e-9 * self.interval:
+    def _slack(self, t: float) -> float:
+        """Return the difference below which two times near `t` are the same."""
+        return same_time(self.interval, t)
+
+    def _check_age(self, state: State, t: float, what: str) -> None:
+        if t < state.t0 - self._slack(t):
+            raise TooLate(f"{what} at t = {t:g} s is older than the start of estimation at {state.t0:g} s")
+        edge = state.t - self.horizon
+        if t < edge - self._slack(t):
             raise TooLate(
                 f"{what} at t = {t:g} s is older than the window, which starts at {edge:g} s; a longer horizon "
                 f"(now {self.horizon:g} s) accepts later arrivals"
@@ -259,7 +280,7 @@ class MHE:
 
     def _check_step(self, t: float, what: str) -> None:
         step = self.model.step
-        if step is not None and abs(t - round(t / step) * step) > 1e-6 * step:
+        if step is not None and abs(t - round(t / step) * step) > max(1e-6 * step, self._slack(t)):
             raise InputError(f"{what} at t = {t:g} s is not at a multiple of the discrete model's step {step:g} s")
 
     def estimate(self, state: State, t: float) -> tuple[State, Estimate]:
@@ -285,15 +306,16 @@ class MHE:
             If no input is known at the window's start for a model with inputs.
         """
         began = self.clock()
+        state = _checked(state, self)
         t = finite_time(t, "estimate")
-        if t < state.t - 1e-9 * self.interval:
+        if t < state.t - self._slack(t):
             raise NotEstimated(
                 f"estimate at t = {t:g} s lies before the last one at {state.t:g} s; "
                 "smooth(state, t) gives estimates of the past"
             )
         t = max(t, state.t)
         start = t - self.horizon
-        growing = start <= state.t0 + 1e-9 * self.interval
+        growing = start <= state.t0 + self._slack(t)
         start = state.t0 if growing else start
         prior, factor, notes = self._prior(state, start, growing)
         records = self._records(state, t, start)
@@ -316,8 +338,9 @@ class MHE:
         """
         if growing:
             return state.start, 1.0, ()
-        if start <= state.t + 1e-9 * self.interval:
-            prior = filtering_prior(self.stage, state.pieces, min(start, state.t))
+        slack = self._slack(state.t)
+        if start <= state.t + slack:
+            prior = filtering_prior(self.stage, state.pieces, min(start, state.t), slack)
             if prior is not None:
                 return prior, 1.0, ()
         gap = max(start - state.t, 0.0)
@@ -326,14 +349,18 @@ class MHE:
         return np.concatenate([x, state.p]), factor, ("prior predicted, uncertified",)
 
     def _records(self, state: State, end: float, start: float) -> Records:
-        y_times, y = state.measurements.arrays(end + 1e-9 * self.interval)
-        u_times, u = state.inputs.arrays(end)
-        if len(self.model.u) and (not len(u_times) or u_times[0] > start + 1e-9 * self.interval):
+        y_times, y = state.measurements.arrays(end + self._slack(end))
+        return Records(y_times, y, *self._known_inputs(state, start, end))
+
+    def _known_inputs(self, state: State, start: float, end: float) -> tuple[Array, Array]:
+        """Return the inputs that matter on [start, end]: for linear hold also the first one behind it, if known."""
+        times, rows = state.inputs.arrays(end, beyond=int(self.assembly.input_linear))
+        if len(self.model.u) and (not len(times) or times[0] > start + self._slack(start)):
             raise InputError(
                 f"no input is known at t = {start:g} s for {', '.join(self.model.u.names)}; give "
                 f"control(state, Input(t={start:g}, u=...)) first"
             )
-        return Records(y_times, y, u_times, u)
+        return times, rows
 
     def _guesses(self, state: State, window: Window) -> list[tuple[str, Guess]]:
         """Return the warm start (the last solution on the new mesh, carried forward) and the prior carried forward."""
@@ -368,6 +395,8 @@ class MHE:
         slot = np.clip(np.searchsorted(last.t, middle, side="right") - 1, 0, len(last.w) - 1)
         inside = (middle >= last.t[0]) & (middle <= last.t[-1])
         w = np.where(inside[:, None], last.w[slot], 0.0)
+        for k in np.flatnonzero(mesh.shared):
+            w[k + 1] = w[k]  # the last cell goes on with its w
         p = state.p if window.p_estimated else window.prior[stage.nx :]
         try:
             for k in range(max(old - 1, 0), n):
@@ -403,6 +432,8 @@ class MHE:
                     x[k] = self.propagate(state, previous, t, state.x if previous <= state.t else x[k - 1], state.p)
                 except FloatingPointError:
                     pass
+        broken = ~np.isfinite(x).all(axis=1)
+        x[broken] = state.x  # never keep what is not finite: the next estimate starts from here
         point = Guess.of(x, np.zeros((n, stage.nw)), state.p, stage.ny)
         try:
             _, y = stage.values(mesh.t[:-1], mesh.h, x[:-1], point.w, point.p, window.u0, window.u1)
@@ -443,6 +474,8 @@ class MHE:
         pieces = state.pieces
         if t > state.t or not pieces:
             pieces = (*pieces, Piece.of(estimate.trajectory, state.t))
+        else:  # the solve at this instant, repeated with what has arrived since
+            pieces = (*pieces[:-1], Piece.of(estimate.trajectory, pieces[-1].start))
         while len(pieces) > 1 and pieces[0].end < t - horizon:
             pieces = pieces[1:]
         edge = t - horizon
@@ -457,7 +490,7 @@ class MHE:
             inputs=state.inputs.drop_before(edge - 1e-6 * self.interval, keep_holding=True),
             pieces=pieces,
             window=estimate.trajectory,
-            active=(point.x_active, point.w_active, point.y_active, point.p_active),
+            active=tuple(map(frozen_set, (point.x_active, point.w_active, point.y_active, point.p_active))),
             solves=state.solves + 1,
         )
 
@@ -468,11 +501,7 @@ class MHE:
         """
         if t1 <= t0:
             return x
-        records = Records(np.empty(0), np.empty((0, len(self.model.y))), *state.inputs.arrays(t1))
-        if len(self.model.u) and not len(records.u_times):
-            raise InputError(
-                f"no input is known for {', '.join(self.model.u.names)}; give control(state, Input(...)) first"
-            )
+        records = Records(np.empty(0), np.empty((0, len(self.model.y))), *self._known_inputs(state, t0, t1))
         mesh = self._prediction_mesh(t0, t1, records)
         u0, u1 = self._inputs_on(mesh, records)
         for k in range(len(mesh)):
@@ -492,8 +521,9 @@ class MHE:
         """Return the undisturbed output (ny,) at `t` for a given state and parameters, under the known input."""
         u = np.empty(0)
         if len(self.model.u):
-            _, rows = state.inputs.arrays(t)
-            u = rows[-1]
+            times, rows = self._known_inputs(state, t, t)
+            u, _ = held_inputs(times, rows, np.array([t, t]), self._slack(t), self.assembly.input_linear)
+            u = u[0]
         return np.asarray(self.model.output(t, x, u, self._silent, p)).reshape(-1)
 
     def predict(self, state: State, t: float) -> Prediction:
@@ -505,7 +535,7 @@ class MHE:
             If `t` lies before the last estimate.
         """
         t = finite_time(t, "predict")
-        if t < state.t - 1e-9 * self.interval:
+        if t < state.t - self._slack(t):
             raise NotEstimated(
                 f"prediction at t = {t:g} s lies before the last estimate at {state.t:g} s; use smooth(state, t)"
             )
@@ -537,7 +567,7 @@ class MHE:
         t = finite_time(t, "trajectory")
         if t == state.t0 and (not state.pieces or state.pieces[0].start == state.t0):
             return frozen(state.start[: self.stage.nx])
-        value = filtering_prior(self.stage, state.pieces, t)
+        value = filtering_prior(self.stage, state.pieces, t, self._slack(t))
         if value is None:
             raise NotEstimated(
                 f"trajectory at t = {t:g} s: kept is the horizon before the last estimate at {state.t:g} s"
@@ -554,12 +584,22 @@ class MHE:
         save_state(state, path, self._fingerprint())
 
     def load(self, path: Any) -> State:
-        """Read a state that an estimator of the same configuration saved."""
+        """Read a state that an estimator of the same signals, horizon, interval, integrator and holds saved.
+
+        Cost, bounds and solver may differ: a saved state can be continued with other weights.
+        """
         return load_state(path, self._fingerprint())
 
     def _fingerprint(self) -> dict[str, Any]:
-        names = {key: list(getattr(self.model, key).names) for key in "xuwpy"}
-        return {"signals": names, "horizon": self.horizon, "interval": self.interval}
+        return {
+            "signals": {key: list(getattr(self.model, key).names) for key in "xuwpy"},
+            "horizon": self.horizon,
+            "interval": self.interval,
+            "integrator": repr(self.integrator),
+            "hold": self.hold,
+            "hold_limit": self.hold_limit,
+            "input_hold": "linear" if self.assembly.input_linear else "zero",
+        }
 
 
 def _trajectory(window: Window, solution: Solution) -> Trajectory:
@@ -568,11 +608,16 @@ def _trajectory(window: Window, solution: Solution) -> Trajectory:
     return Trajectory(*(frozen(part) for part in parts))
 
 
-def _positive(what: str, value: float) -> float:
-    number = float(value)
-    if not (np.isfinite(number) and number > 0):
-        raise InputError(f"{what} must be a positive number of seconds, got {value}")
-    return number
+def _checked(state: Any, mhe: MHE) -> State:
+    """Return `state`, or raise `InputError` when it is not a state of this estimator."""
+    if not isinstance(state, State):
+        hint = "; estimate returns the pair (state, estimate): unpack it" if isinstance(state, tuple) else ""
+        raise InputError(
+            f"expected the state that init, observe or estimate returned, got {type(state).__name__}{hint}"
+        )
+    if (len(state.start), state.measurements.width) != (mhe.stage.nx + mhe.stage.np, mhe.stage.ny):
+        raise InputError(f"this state belongs to another model than {mhe.model.name!r}: it has other signals")
+    return state
 
 
 def _rebuild(configuration: dict[str, Any]) -> MHE:

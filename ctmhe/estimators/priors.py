@@ -54,23 +54,27 @@ def trajectory_at(stage: StageFunction, trajectory: Trajectory, t: float) -> Arr
     return x
 
 
-def piece_at(pieces: tuple[Piece, ...], t: float) -> Piece | None:
-    """Return the piece whose solve is the first at or after `t` (3.17), None when `t` lies outside what is kept."""
-    if not pieces or t > pieces[-1].end or t <= pieces[0].start:
+def piece_at(pieces: tuple[Piece, ...], t: float, tolerance: float) -> Piece | None:
+    """Return the piece whose solve is the first at or after `t` (3.17), None when `t` lies outside what is kept.
+
+    Times closer than `tolerance` (seconds) to a solve instant are that instant: round-off must not choose the piece.
+    """
+    if not pieces or t > pieces[-1].end + tolerance or t <= pieces[0].start + tolerance:
         return None
     low, high = 0, len(pieces) - 1
     while low < high:
         middle = (low + high) // 2
-        if pieces[middle].end >= t:
+        if pieces[middle].end >= t - tolerance:
             high = middle
         else:
             low = middle + 1
     return pieces[low]
 
 
-def filtering_prior(stage: StageFunction, pieces: tuple[Piece, ...], t: float) -> Array | None:
+def filtering_prior(stage: StageFunction, pieces: tuple[Piece, ...], t: float, tolerance: float) -> Array | None:
     """Return (x_hat(t), p_hat(t)) of the estimated trajectory: the prior (3.18). None where it is not kept."""
-    piece = piece_at(pieces, t)
+    piece = piece_at(pieces, t, tolerance)
     if piece is None:
         return None
+    t = min(t, piece.end)
     return np.concatenate([trajectory_at(stage, piece.trajectory, t), piece.trajectory.p])

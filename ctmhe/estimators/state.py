@@ -55,6 +55,13 @@ class State:
     solves: int = 0
 
 
+def frozen_set(active: Any) -> np.ndarray:
+    """Return a read-only copy of one part of an active set."""
+    array = np.array(active, dtype=np.int8)
+    array.flags.writeable = False
+    return array
+
+
 def save_state(state: State, path: str | Path, fingerprint: dict[str, Any]) -> None:
     """Write a state to a versioned `.npz` file (no pickle inside), in one atomic step."""
     arrays: dict[str, Array] = {"start": state.start, "x": state.x, "p": state.p}
@@ -77,9 +84,12 @@ def save_state(state: State, path: str | Path, fingerprint: dict[str, Any]) -> N
     }
     path = Path(path)
     temporary = path.with_name(path.name + ".part")
-    with temporary.open("wb") as file:
-        np.savez(file, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
-    temporary.replace(path)
+    try:
+        with temporary.open("wb") as file:
+            np.savez(file, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
+        temporary.replace(path)
+    except OSError as error:
+        raise InputError(f"state: cannot write {str(path)!r}: {error}") from error
 
 
 def load_state(path: str | Path, fingerprint: dict[str, Any]) -> State:
@@ -118,6 +128,6 @@ def load_state(path: str | Path, fingerprint: dict[str, Any]) -> State:
         inputs=log("inputs"),
         pieces=tuple(Piece(a, b, trajectory(f"piece{i}")) for i, (a, b) in enumerate(header["pieces"])),
         window=window,
-        active=tuple(arrays[f"active{i}"] for i in range(4)) if window is not None else (),
+        active=tuple(frozen_set(arrays[f"active{i}"]) for i in range(4)) if window is not None else (),
         solves=header["solves"],
     )

@@ -71,10 +71,13 @@ class Solver(Protocol):
 
 
 def clip_to_bounds(window: Window, guess: Guess) -> Guess:
-    """Return the guess with x, w, p moved inside their boxes."""
+    """Return the guess with x, w, p moved inside their boxes and one w for all slots of a cell."""
+    w = np.clip(guess.w, window.w_lower, window.w_upper)
+    for k in np.flatnonzero(window.mesh.shared):
+        w[k + 1] = w[k]
     return Guess(
         np.clip(guess.x, window.x_lower, window.x_upper),
-        np.clip(guess.w, window.w_lower, window.w_upper),
+        w,
         np.clip(guess.p, window.p_lower, window.p_upper) if window.p_estimated else guess.p,
         guess.x_active,
         guess.w_active,

@@ -120,7 +120,7 @@ class CompiledGaussNewton:
             y = np.full((n, self.stage.q, self.stage.ny), np.nan)
             message = "the model is not finite at the guess"
             return Solution(clip_to_bounds(window, guess), y, float("inf"), False, message)
-        x, w, p, x_active, w_active, y_active, p_active, y, *multipliers = memory.read(n)
+        x, w, p, x_active, w_active, y_active, p_active, y, *multipliers = memory.read()
         return Solution(
             Guess(x, w, p, x_active, w_active, y_active, p_active),
             y,
@@ -158,14 +158,9 @@ class _Memory:
             "x_scale": (nx,), "w_scale": (nw,), "p_scale": (n_p,), "y_scale": (ny,),
         }  # fmt: skip
         self.inputs = {key: np.zeros(s, np.uint8 if key == "shared" else float) for key, s in shapes.items()}
-        shapes = {
-            "x": (n + 1, nx), "w": (n, nw), "p": (n_p,), "x_active": (n + 1, nx), "w_active": (n, nw),
-            "y_active": (n, ny), "p_active": (n_p,), "y": (n, q, ny), "dynamics_multiplier": (n, nx),
-            "x_multiplier": (n + 1, nx), "w_multiplier": (n, nw), "y_multiplier": (n, ny), "p_multiplier": (n_p,),
-        }  # fmt: skip
-        self.outputs = {key: np.zeros(s, np.int8 if "active" in key else float) for key, s in shapes.items()}
         self.window = _Window(**{key: array.ctypes.data for key, array in self.inputs.items()})
-        self.result = _Result(**{key: array.ctypes.data for key, array in self.outputs.items()})
+        self.result = _Result()
+        self._lay_out(capacity)
         self.options = _Options()
         self.functions = _Functions(core, stage)
         structure = self.functions.structure
@@ -181,9 +176,28 @@ class _Memory:
         self._whole = [(key, self.inputs[key]) for key in fixed if self.inputs[key].size]
         self._scales = [(key, self.inputs[key]) for key in ("x_scale", "w_scale", "p_scale", "y_scale")]
         self._known: list[Any] = [None] * 4
-        pairs = self.outputs.items()
-        self._start = [(key, array, key in ("x", "x_active")) for key, array in pairs if key in _GUESSED]
-        self._end = [(array, 1 if key[0] == "x" else 0 if key[0] != "p" else -1) for key, array in pairs]
+
+    def _lay_out(self, n: int) -> None:
+        """Place the results of a window of n slots in two blocks of memory, so that two copies fetch them."""
+        stage = self.stage
+        x, w, y, p = (n + 1, stage.nx), (n, stage.nw), (n, stage.ny), (stage.np,)
+        shapes = (x, w, p, x, w, y, p, (n, stage.q, stage.ny), (n, stage.nx), x, w, y, p)
+        used = {float: 0, np.int8: 0}
+        self._views: list[tuple[bool, slice, tuple[int, ...]]] = []
+        for key, shape in zip(RESULT_ARRAYS, shapes, strict=True):
+            kind = np.int8 if key.endswith("active") else float
+            start = used[kind]
+            used[kind] += int(np.prod(shape))
+            self._views.append((kind is np.int8, slice(start, used[kind]), shape))
+        self._blocks = [np.zeros(used[kind] + 1, kind) for kind in (float, np.int8)]
+        outputs = self._view(self._blocks)
+        for key, array in zip(RESULT_ARRAYS, outputs, strict=True):
+            setattr(self.result, key, array.ctypes.data)
+        self._start = list(zip(_GUESSED, outputs, strict=False))
+        self.n = n
+
+    def _view(self, blocks: list[np.ndarray]) -> list[np.ndarray]:
+        return [blocks[which][part].reshape(shape) for which, part, shape in self._views]
 
     def write(self, window: Window, guess: Guess, n: int) -> None:
         """Copy a window and a guess to where the core reads them."""
@@ -204,15 +218,14 @@ class _Memory:
             scale = getattr(window, key)
             if scale is not self._known[i]:
                 array[:] = self._known[i] = scale
-        for key, array, edge in self._start:
-            if key[0] == "p":
-                array[:] = getattr(guess, key)
-            else:
-                array[: n + edge] = getattr(guess, key)
+        if n != self.n:
+            self._lay_out(n)
+        for key, array in self._start:
+            array[...] = getattr(guess, key)
 
-    def read(self, n: int) -> list[Array]:
+    def read(self) -> list[Array]:
         """Return copies of the results, in the order of `RESULT_ARRAYS`."""
-        return [array.copy() if edge < 0 else array[: n + edge].copy() for array, edge in self._end]
+        return self._view([block.copy() for block in self._blocks])
 
 
 _GUESSED = ("x", "w", "p", "x_active", "w_active", "y_active", "p_active")
@@ -236,7 +249,9 @@ class _Functions:
         sizes = (ctypes.c_longlong * 4)()
         getattr(core, f"{name}_work")(*(ctypes.byref(sizes, 8 * i) for i in range(4)))
         if max(sizes[0], sizes[1]) > MAX_ARGUMENTS:
-            raise SolverError(f"the compiled function {name} needs {max(sizes[0], sizes[1])} pointers; rebuild the core")
+            raise SolverError(
+                f"the compiled function {name} needs {max(sizes[0], sizes[1])} pointers; rebuild the core"
+            )
         iw, w = np.zeros(sizes[2] + 1, np.int64), np.zeros(sizes[3] + 1)
         self.kept += [iw, w]
         address = ctypes.cast(getattr(core, name), ctypes.c_void_p).value

@@ -46,6 +46,11 @@ class Compiler:
     command: tuple[str, ...]
     identity: str
 
+    @property
+    def gnu(self) -> bool:
+        """Whether it takes the flags that only GCC knows."""
+        return "clang" not in self.identity.lower() and "zig" not in self.identity.lower()
+
 
 @dataclass(frozen=True)
 class Source:
@@ -160,7 +165,8 @@ def build_library(
     identity : str
         Determines, with `sources`, what is compiled: included files, whatever the sources are generated from.
     flags, defines, include
-        Flags, macros and include folders (no part of the key) for every source. `$CTMHE_CFLAGS` comes last.
+        Flags, macros and include folders (no part of the key) for every source. A source's own flags and then
+        `$CTMHE_CFLAGS` follow.
     compiler : Compiler, optional
         Default: `find_compiler()`.
 
@@ -173,9 +179,11 @@ def build_library(
     if compiler is None:
         raise SolverError("no C compiler found: install one, or pip install 'ctmhe[compile]'")
     macros = tuple(f"-D{key}={value}" for key, value in (defines or {}).items())
-    flags = (*FLAGS, *SHARED, *flags, *macros, *extra_flags())
+    flags = (*FLAGS, *SHARED, *flags, *macros)
     given = "" if callable(sources) else [(source.name, source.text, source.flags) for source in sources]
-    content = json.dumps([FORMAT, sysconfig.get_platform(), compiler.identity, flags, LINK, identity, given])
+    content = json.dumps(
+        [FORMAT, sysconfig.get_platform(), compiler.identity, flags, extra_flags(), LINK, identity, given]
+    )
     key = f"{name}-{sha256(content.encode()).hexdigest()[:32]}"
     root = cache_directory()
     found = _cached(root, key)
@@ -287,10 +295,10 @@ def _compile(
             for source in sources:
                 (folder / source.name).write_text(source.text, encoding="utf-8")
                 objects.append(f"{source.name}.o")
-                commands.append([*flags, *source.flags, *folders, "-c", source.name, "-o", objects[-1]])
+                commands.append([*flags, *source.flags, *extra_flags(), *folders, "-c", source.name, "-o", objects[-1]])
             _run(compiler, name, commands, folder)
             library = f"{name}{SUFFIX}"
-            _run(compiler, name, [[*flags, "-shared", *objects, "-o", library, *LINK]], folder)
+            _run(compiler, name, [[*flags, *extra_flags(), "-shared", *objects, "-o", library, *LINK]], folder)
             content = (folder / library).read_bytes()
     except OSError as error:
         raise SolverError(f"compiling the {name} library failed: {error}") from error

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from threading import local
 
 import numpy as np
@@ -15,6 +18,8 @@ from ctmhe.types import Array
 
 ARMIJO = 1e-4
 DAMPING_START, DAMPING_LIMIT = 1e-8, 1e8
+ROUND_OFF = 1e-15
+MEMORY = 4  # iterates that the merit function may fall back on
 SLOW = 0.05  # predicted decreases that shrink by less than this factor call for second derivatives
 
 
@@ -35,7 +40,8 @@ class GaussNewton:
     """The default solver.
 
     Each iteration linearises all slots, solves the quadratic program with its bounds, and takes a step that decreases
-    the exact penalty function J/2 + rho (|dynamics defect|_1 + |output bound excess|_1), backtracking where needed;
+    the exact penalty function J/2 + rho (|dynamics defect|_1 + |output bound excess|_1) below the largest of its last
+    values, backtracking where needed;
     when no step does, a Levenberg term is added and raised. It stops when the predicted decrease falls below
     `tolerance` relative to the cost and the dynamics hold. Gauss-Newton converges linearly where residuals are large
     and the model is curved; when that is slow, the second derivatives of the stage (symbolic models) are added and
@@ -62,7 +68,7 @@ class GaussNewton:
 
     def _solve(self, window: Window, guess: Guess) -> Solution:
         kkt = self._system(window)
-        floor = self.stage.accuracy**2 * self._data_scale(window)
+        data = self._data_scale(window)
         factorizations, damping, rho = 0, 0.0, 0.0
         step: Step | None = None
         optimality = last_decrease = float("nan")
@@ -76,6 +82,7 @@ class GaussNewton:
             return self._failed(window, guess, str(error))
         if not np.isfinite(current.cost):
             return self._failed(window, guess, "the model is not finite at the guess")
+        recent = deque([(current.cost, current.infeasibility)], maxlen=MEMORY)
         message, success = f"no convergence in {self.max_iterations} iterations", False
         iteration = 0
         while iteration < self.max_iterations:
@@ -99,10 +106,10 @@ class GaussNewton:
             rho = max(
                 rho, 1.5 * float(np.abs(step.dynamics).max(initial=0.0)), 1.5 * float(np.abs(step.zy).max(initial=0.0))
             )
-            if self._feasible(current) and _largest(step) <= 100 * self.stage.accuracy:
+            if damping == 0.0 and self._feasible(current) and _largest(step) <= 100 * self.stage.accuracy:
                 message, success = "converged to the accuracy of the integrator", True
                 break
-            trial, alpha = self._line_search(window, current, step, rho, predicted)
+            trial, alpha = self._line_search(window, current, step, rho, predicted, recent)
             if trial is None and newton:
                 newton, last_decrease = False, float("nan")
                 continue
@@ -112,13 +119,16 @@ class GaussNewton:
                     message = "no step decreases the merit function"
                     break
                 continue
+            light = damping <= 10 * DAMPING_START * _typical_curvature(qp)  # else the small step is the damping's doing
             damping = 0.0 if damping < DAMPING_START * _typical_curvature(qp) else 0.1 * damping
             slow = iteration > 4 and abs(predicted) > SLOW * abs(last_decrease)
             newton = self.stage.symbolic and alpha == 1.0 and (newton or slow)
             last_decrease = predicted
             current = trial
-            small = abs(predicted) <= max(self.tolerance * current.cost, floor) and alpha == 1.0
-            if small and self._feasible(current):
+            recent.append((current.cost, current.infeasibility))
+            noise = ROUND_OFF * np.sqrt(current.cost * data) + self.stage.accuracy**2 * data
+            small = abs(predicted) <= self.tolerance * current.cost + noise and alpha == 1.0
+            if small and light and self._feasible(current):
                 message, success = "converged", True
                 break
         point = current.point
@@ -180,9 +190,16 @@ class GaussNewton:
         return _Iterate(point, linear, cost_of(window, point, linear.y), defect, excess)
 
     def _line_search(
-        self, window: Window, current: _Iterate, step: Step, rho: float, predicted: float
+        self,
+        window: Window,
+        current: _Iterate,
+        step: Step,
+        rho: float,
+        predicted: float,
+        recent: Iterable[tuple[float, float]],
     ) -> tuple[_Iterate | None, float]:
-        merit = current.cost / 2 + rho * current.infeasibility
+        # not above the worst of the last few: curved dynamics would cut good full steps (the Maratos effect)
+        merit = max(cost / 2 + rho * infeasibility for cost, infeasibility in recent)
         # directional derivative of the exact penalty along the step: model slope minus removed infeasibility
         slope = -max(predicted, 0.0) - rho * current.infeasibility
         noise = 1e-13 * max(merit, 1e-300)
@@ -306,31 +323,50 @@ class GaussNewton:
         """
         stage = self.stage
         kkt = KKT(stage.nx, stage.nw, 0, stage.np * window.p_estimated)
-        qp = self._quadratic_program(window, self._evaluate(window, point), kkt)
-        scale = np.concatenate([window.x_scale, window.p_scale[: kkt.np]])
-        weight = _typical_curvature(qp)
-        small, large = (kkt.end_covariance(qp, factor * weight) for factor in (1e-13, 1e-12))
+        size = stage.nx + kkt.np
+        try:
+            with np.errstate(all="ignore"):
+                current = self._evaluate(window, point)
+                window = _equilibrated(window, self._quadratic_program(window, current, kkt))
+                qp = self._quadratic_program(window, self._judge(window, point, current.linear), kkt)
+                small, large = (kkt.end_covariance(qp, factor) for factor in (1e-13, 1e-12))
+        except (Singular, FloatingPointError):
+            return np.where(np.eye(size, dtype=bool), np.inf, np.nan), 0
         values, vectors = np.linalg.eigh((small + small.T) / 2)
-        shrunk = np.einsum("ji,jk,ki->i", vectors, large, vectors)
-        undetermined = values > 3.0 * np.abs(shrunk)
-        rank = int(len(values) - undetermined.sum())
+        undetermined = values > 3.0 * np.abs(np.einsum("ji,jk,ki->i", vectors, large, vectors))
         kept = vectors[:, ~undetermined]
         covariance = kept @ np.diag(values[~undetermined]) @ kept.T
         if not undetermined.any():
-            try:
-                exact = kkt.end_covariance(qp, 0.0)
-                covariance = (exact + exact.T) / 2
-            except Singular:
-                pass
+            with suppress(Singular):
+                covariance = kkt.end_covariance(qp, 0.0)
+                covariance = (covariance + covariance.T) / 2
+        scale = np.concatenate([window.x_scale, window.p_scale[: kkt.np]])
         covariance = covariance * scale[:, None] * scale
         for i in np.flatnonzero((np.abs(vectors[:, undetermined]) > 1e-5).any(axis=1)):
             covariance[i, :] = covariance[:, i] = np.nan
             covariance[i, i] = np.inf
-        return covariance, rank
+        return covariance, int(size - undetermined.sum())
 
     def _failed(self, window: Window, guess: Guess, message: str) -> Solution:
         y = np.full((len(window.mesh), self.stage.q, self.stage.ny), np.nan)
         return Solution(guess, y, float("inf"), False, message)
+
+
+def _equilibrated(window: Window, qp: QuadraticProgram) -> Window:
+    """Return the window with scales that give every signal a curvature of about one, whatever its unit."""
+
+    def scaled(scale: Array, diagonal: Array) -> Array:
+        return np.where(diagonal > 0, scale / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)), scale)
+
+    diagonals = [np.einsum("kii->ki", H).max(axis=0, initial=0.0) for H in (qp.Hxx, qp.Hww)]
+    p_scale = window.p_scale.copy()
+    p_scale[: len(qp.Hpp)] = scaled(p_scale[: len(qp.Hpp)], np.diagonal(qp.Hpp))
+    return replace(
+        window,
+        x_scale=scaled(window.x_scale, diagonals[0]),
+        w_scale=scaled(window.w_scale, diagonals[1]),
+        p_scale=p_scale,
+    )
 
 
 def _parts(active: ActiveSet) -> tuple[np.ndarray, ...]:

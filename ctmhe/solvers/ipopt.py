@@ -28,6 +28,7 @@ OPTIONS: dict[str, Any] = {
     "ipopt.bound_relax_factor": 0.0,
     "ipopt.max_iter": 200,
     "show_eval_warnings": False,
+    "calc_lam_p": False,
 }
 
 

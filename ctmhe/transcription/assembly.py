@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,7 @@ from ctmhe.data.window import held_inputs, held_signal, point_rows
 from ctmhe.errors import InputError
 from ctmhe.models.continuous import Model, box_arrays
 from ctmhe.models.signals import Signals
-from ctmhe.transcription.grid import Mesh, build_mesh, discounted_length
+from ctmhe.transcription.grid import Mesh, build_mesh, discounted_length, same_time
 from ctmhe.transcription.problem import Window
 from ctmhe.transcription.stage import StageFunction
 from ctmhe.transcription.weights import WeightFunction, square_root, weight_matrix
@@ -69,7 +70,8 @@ class Assembly:
     ):
         self.model, self.stage, self.cost = model, stage, cost
         self.interval, self.parts, self.hold_limit = interval, parts, hold_limit
-        self.filtering = filtering or cost.S is not None
+        self.filtering = filtering
+        self.end_slot = filtering or cost.S is not None  # discrete: a slot of no length that carries the newest output
         self.discrete = model.step is not None
         kinds = hold_kinds(model, hold)
         self.held = np.array([kind != "point" for kind in kinds])
@@ -105,27 +107,36 @@ class Assembly:
         if self.discrete:
             return self._steps(start, end)
         samples = records.y_times[np.isfinite(records.y).any(axis=1)]
-        tolerance = 1e-9 * self.interval
-        at_start = samples[np.abs(samples - start) <= tolerance]
+        at_start = samples[np.abs(samples - start) <= same_time(self.interval, start)]
         point = bool(growing and len(at_start) and np.isfinite(records.y[:, ~self.held]).any())
-        instants = np.concatenate([samples, records.u_times])
+        instants = np.concatenate([samples, records.u_times, *self._expiries(records)])
         return build_mesh(start, end, self.interval, self.parts, instants, sample_at_start=point)
+
+    def _expiries(self, records: Records) -> list[Array]:
+        """Return when held samples stop counting because no newer one has come: the integrand jumps there."""
+        found = []
+        for s in np.flatnonzero(self.held):
+            spoken = records.y_times[np.isfinite(records.y[:, s])]
+            following = np.append(spoken[1:], np.inf)
+            found.append(spoken[following > spoken + self.hold_limit] + self.hold_limit)
+        return found
 
     def _steps(self, start: float, end: float) -> Mesh:
         step = self.interval
+        tolerance = max(1e-6 * step, same_time(step, end))
         first, last = round(start / step), round(end / step)
         for what, t, k in (("start", start, first), ("end", end, last)):
-            if abs(t - k * step) > 1e-6 * step:
+            if abs(t - k * step) > tolerance:
                 raise InputError(
                     f"the window's {what} t = {t:g} s is not a multiple of the discrete model's step {step:g} s; "
                     "estimate and measure at whole steps"
                 )
         edges = np.arange(first, last + 1) * step
-        if self.filtering or len(edges) == 1:
+        if self.end_slot or len(edges) == 1:
             edges = np.append(edges, edges[-1])
         h = np.diff(edges)
         cell = np.arange(first, first + len(h))
-        return Mesh(edges, h, np.zeros(len(h), dtype=bool), cell, 1e-6 * step)
+        return Mesh(edges, h, np.zeros(len(h), dtype=bool), cell, tolerance)
 
     def window(
         self, start: float, end: float, records: Records, prior: Array, *, growing: bool, prior_factor: float = 1.0
@@ -143,7 +154,7 @@ class Assembly:
             L_y, y_data, end_known = self._outputs(mesh, end, records)
         y_lower, y_upper = self._output_bounds(n, y_data[:, -1], end_known)
         w_lower, w_upper = (np.broadcast_to(side, (n, stage.nw)).copy() for side in self.boxes["w"])
-        if not self.discrete:
+        if not (self.discrete and self.filtering):
             idle = (mesh.h == 0) & ~mesh.shared
             w_lower[idle] = w_upper[idle] = 0.0
         x_lower, x_upper = (np.broadcast_to(side, (n + 1, stage.nx)) for side in self.boxes["x"])
@@ -181,9 +192,12 @@ class Assembly:
         return np.sqrt(weight)[:, None, None] * self.Q.roots(mesh.t[:-1] + mesh.h / 2)
 
     def _step_weights(self, mesh: Mesh, end: float) -> Array:
-        """Return eta^(N-j-1) in the prediction form, eta^(N-j) in the filtering form."""
-        k = np.arange(len(mesh))
-        return np.exp(-self.rate * self.interval * (len(mesh) - 1 - k))
+        """Return eta^(N-j-1) in the prediction form, eta^(N-j) in the filtering form; 0 for an idle end slot."""
+        steps = int(np.count_nonzero(mesh.h))
+        weight = np.exp(-self.rate * self.interval * (steps - 1 + int(self.filtering) - np.arange(len(mesh))))
+        if not self.filtering:
+            weight[steps:] = 0.0
+        return weight
 
     def _outputs(self, mesh: Mesh, end: float, records: Records) -> tuple[Array, Array, np.ndarray]:
         stage, n, ny = self.stage, len(mesh), self.stage.ny
@@ -237,12 +251,11 @@ class Assembly:
             row = np.isfinite(records.y[i])
             y_data[k, 0, row] = records.y[i, row]
             known[k, row] = True
-        if not self.filtering and mesh.h[-1] == 0:
-            known[-1] = False
         weight = np.sqrt(self._step_weights(mesh, end))
         L_y = weight[:, None, None] * self.R.roots(mesh.t[:-1], known)
         if self.S is not None and known[-1].any() and mesh.h[-1] == 0:
-            L_y[-1] = self.S.root(end, known[-1])
+            terminal = self.S.root(end, known[-1])
+            L_y[-1] = square_root(L_y[-1].T @ L_y[-1] + terminal.T @ terminal)
         return L_y[:, None], y_data, known
 
     def _output_bounds(self, n: int, y_end: Array, known: np.ndarray) -> tuple[Array, Array]:
@@ -261,6 +274,8 @@ def hold_kinds(model: Model, hold: Any) -> list[str]:
         kinds = [default] * len(model.y)
     elif isinstance(hold, str):
         kinds = [hold] * len(model.y)
+    elif not isinstance(hold, Mapping):
+        raise InputError(f"hold must be one of {', '.join(HOLDS)}, or a mapping from outputs to these; got {hold!r}")
     else:
         kinds = [default] * len(model.y)
         for name, kind in dict(hold).items():

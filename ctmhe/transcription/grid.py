@@ -11,6 +11,11 @@ from ctmhe.types import Array
 ROUND_OFF = 1e-9  # times the shooting interval: edges closer than this are the same instant
 
 
+def same_time(interval: float, t: float) -> float:
+    """Return how close two times near `t` must be to count as one: round-off of the interval or of the clock."""
+    return max(ROUND_OFF * interval, 8 * float(np.spacing(abs(t))))
+
+
 @dataclass(frozen=True, eq=False)
 class Mesh:
     """Slots of a window.
@@ -57,7 +62,7 @@ def build_mesh(
     sample_at_start : bool
         Put a slot of length zero in front, whose end is the window's start: a sample there has its residual at once.
     """
-    tolerance = ROUND_OFF * interval
+    tolerance = same_time(interval, end)
     first, last = int(np.floor(start / interval * parts)), int(np.ceil(end / interval * parts))
     k = np.arange(first, last + 1)
     steps = (k // parts) * interval + (k % parts) * (interval / parts)

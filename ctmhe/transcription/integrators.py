@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import casadi as ca
 import numpy as np
 
-from ctmhe.errors import InputError
 from ctmhe.models.continuous import Model
-from ctmhe.types import Array
-
+from ctmhe.types import Array, positive
 
 ROUND_OFF = 1e-14
 
 
+@runtime_checkable
 class Integrator(Protocol):
     """Carries the state over one slot and visits the nodes of the output integral.
 
@@ -74,8 +73,7 @@ class RK4:
     accuracy = ROUND_OFF
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.step) and self.step > 0):
-            raise InputError(f"RK4: step must be a positive number of seconds, got {self.step}")
+        positive("RK4: step", self.step, "seconds")
 
     def parts(self, interval: float) -> int:
         """Return the number of equal steps, none longer than `step`, in a cell."""
@@ -126,9 +124,7 @@ class CVODES:
 
     def __post_init__(self) -> None:
         for name in ("rtol", "atol"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise InputError(f"CVODES: {name} must be positive, got {value}")
+            positive(f"CVODES: {name}", getattr(self, name))
 
     def parts(self, interval: float) -> int:
         """Return 1: CVODES chooses its steps itself."""

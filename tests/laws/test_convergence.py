@@ -72,3 +72,19 @@ def test_splitting_a_slot_inside_a_step_only_refines_it():
     t = estimates[1].trajectory.t
     k = int(np.searchsorted(t, 0.333))
     np.testing.assert_allclose(w[k - 1], w[k], rtol=1e-12)  # slots of one cell share w
+
+
+def test_a_signal_that_expires_between_steps_does_so_at_its_time():
+    """hold_limit ends inside a step: the instant is an edge, so refinement still converges at order 4."""
+    from ctmhe.types import DiscountedCost
+    from tests.conftest import linear_model
+
+    model = linear_model([[0, 1], [-1, 0]], np.eye(2), [[1.0, 0.0]])
+    cost = DiscountedCost(P=1.0, Q=1.0, R=10.0)
+
+    def end(step):
+        mhe = MHE(model, horizon=1, interval=0.1, integrator=RK4(step), cost=cost, hold_limit=0.2)
+        return mhe.estimate(feed(mhe, mhe.init(x=[0, 0]), [0.033], [[1.0]]), 0.5)[1].x
+
+    errors = [np.abs(end(0.1 / n) - end(0.1 / 32)).max() for n in (1, 2)]
+    assert errors[0] < 1e-5 and errors[0] / errors[1] > 10

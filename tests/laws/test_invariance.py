@@ -136,6 +136,69 @@ def test_an_input_given_late_inside_the_window_counts_from_its_own_time():
     same(*results)
 
 
+def test_times_may_be_shifted():
+    """Dynamics that do not depend on time: the same estimates wherever the clock stands, also if t - T is a solve."""
+    found = []
+    for t0 in (0.0, -3.1, 1e3, 1e6):
+        mhe = oscillator_mhe(horizon=0.4, interval=0.02, hold="zero")
+        state, estimates = mhe.init(t=t0, x=[1, 0]), []
+        for k in range(1, 60):
+            t = t0 + k * 0.02
+            state = mhe.observe(state, Measurement(t, [np.cos(k), np.sin(0.3 * k)]))
+            if k % 2 == 0:
+                state, estimate = mhe.estimate(state, t)
+                estimates.append(estimate.x)
+        found.append(estimates)
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], atol=1e-7)
+
+
+def test_one_cell_has_one_disturbance_also_when_an_estimate_fell_inside_it(rng):
+    """Estimates off the cell grid: w is constant on every cell and the cost is the reference solver's."""
+    mhe = oscillator_mhe(interval=0.5, horizon=1.0)
+    state, t = mhe.init(x=[1, 0]), 0.0
+    for _ in range(12):
+        t += rng.uniform(0.05, 0.4)
+        state = mhe.observe(state, Measurement(t, rng.normal(size=2)))
+        before = state
+        state, estimate = mhe.estimate(state, t + 0.03)
+        assert estimate.status.success
+        trajectory = estimate.trajectory
+        cell = np.floor((trajectory.t[:-1] + trajectory.t[1:]) / 2 / 0.5)
+        for j in np.unique(cell):
+            np.testing.assert_allclose(np.ptp(trajectory.w[cell == j], axis=0), 0, atol=1e-9)
+        assert estimate.cost == pytest.approx(mhe.reference(before, t + 0.03).cost, rel=1e-8)
+
+
+def test_states_and_estimates_copy_and_pickle(tmp_path):
+    """A state that went through pickle or a deep copy continues identically; nobody can write into it."""
+    import copy
+
+    mhe = MHES["zero"]
+    state, estimate = mhe.estimate(feed(mhe, mhe.init(x=[1, 0]), TIMES, rows()), 1.3)
+    for other in (copy.deepcopy(state), pickle.loads(pickle.dumps(state))):
+        same(mhe.estimate(state, 1.5)[1], mhe.estimate(other, 1.5)[1])
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(estimate)).x, estimate.x)
+    for array in (*state.active, state.x, state.start, estimate.trajectory.x):
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 0
+
+
+def test_a_linear_input_is_interpolated_to_the_next_known_one():
+    """dx/dt = u with u from 0 to 1 over a second: x(0.5) = 0.125, for estimate and prediction."""
+    from ctmhe.estimators import MHE
+    from ctmhe.models import ContinuousModel
+    from ctmhe.transcription import RK4
+    from ctmhe.types import DiscountedCost
+
+    model = ContinuousModel(lambda t, x, u, w, p: u + w, lambda t, x, u, w, p: x, x="x", u="u", w="w", y="y")
+    mhe = MHE(model, horizon=2, interval=0.1, integrator=RK4(0.1), cost=DiscountedCost(), input_hold="linear")
+    state = mhe.control(mhe.control(mhe.init(x=[0.0]), Input(0.0, [0.0])), Input(1.0, [1.0]))
+    state, estimate = mhe.estimate(state, 0.5)
+    assert estimate.x[0] == pytest.approx(0.125, rel=1e-9)
+    assert mhe.predict(state, 0.75).x[0] == pytest.approx(0.75**2 / 2, rel=1e-9)
+
+
 def test_discounting_weighs_the_past_less():
     """With eta = 1 an old outlier pulls the estimate more than with eta = 0.1."""
     pulls = []

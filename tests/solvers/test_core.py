@@ -106,9 +106,7 @@ def test_irregular_samples_share_disturbances(rng, library, kind):
     """Slots inside a cell have one w, bounded or not, at irregular samples and with a residual bound."""
     model = batch_reactor()
     for bounds in (Bounds(), Bounds(w=(-0.05, 0.05)), Bounds(w=(-0.3, 0.3), x=(0.1, 2.2), residual=(-0.4, 0.4))):
-        mhe = MHE(
-            model, horizon=1.0, interval=0.1, integrator=RK4(0.1), cost=REACTOR_COST, bounds=bounds, hold=kind
-        )
+        mhe = MHE(model, horizon=1.0, interval=0.1, integrator=RK4(0.1), cost=REACTOR_COST, bounds=bounds, hold=kind)
         state, t = mhe.init(x=[2.0, 1.0]), 0.0
         while t < 0.93:
             state = mhe.observe(state, Measurement(t, [3.0 + 0.1 * rng.normal()]))
@@ -121,9 +119,7 @@ def test_irregular_samples_share_disturbances(rng, library, kind):
 def test_output_bounds_are_met(rng, library):
     """Bounds of an output, active, cost what they cost IPOPT."""
     model = batch_reactor()
-    mhe = MHE(
-        model, horizon=1.0, interval=0.05, integrator=RK4(0.05), cost=REACTOR_COST, bounds=Bounds(y=(3.2, 4.0))
-    )
+    mhe = MHE(model, horizon=1.0, interval=0.05, integrator=RK4(0.05), cost=REACTOR_COST, bounds=Bounds(y=(3.2, 4.0)))
     state = mhe.init(x=[2.5, 1.0])
     for k in range(20):
         state = mhe.observe(state, Measurement(0.05 * k, [3.2 + 0.05 * rng.normal()]))

@@ -10,7 +10,8 @@
  * start and are eliminated there, with x_0. A pivot that is zero to rounding gives a zero row: no step that way.
  *
  * Bounds held on w, p and x_0 are substituted. Bounds held on later states and on outputs are stiff springs with
- * multipliers (an augmented Lagrangian); right-hand-side solves with the same factor bring them onto the bound.
+ * multipliers (an augmented Lagrangian); right-hand-side solves with the same factor bring them onto the bound. When
+ * the active set does not settle, a primal-dual interior point method (all bounds as springs) finds it.
  */
 #include "core.h"
 
@@ -18,11 +19,11 @@
 #include <string.h>
 
 #ifdef CTMHE_NX
-#define NX(s) CTMHE_NX
-#define NW(s) CTMHE_NW
-#define NP(s) CTMHE_NP
-#define NY(s) CTMHE_NY
-#define NQ(s) CTMHE_NQ
+#define NX(s) ((void)(s), CTMHE_NX)
+#define NW(s) ((void)(s), CTMHE_NW)
+#define NP(s) ((void)(s), CTMHE_NP)
+#define NY(s) ((void)(s), CTMHE_NY)
+#define NQ(s) ((void)(s), CTMHE_NQ)
 #else
 #define NX(s) ((s)->nx)
 #define NW(s) ((s)->nw)
@@ -41,7 +42,10 @@
 #define DAMPING_START 1e-8
 #define DAMPING_LIMIT 1e8
 #define SLOW 0.05          /* predicted decreases that shrink by less than this factor call for second derivatives */
-#define MAX_CHANGES 60     /* passes of the active set method in one quadratic program */
+#define MAX_CHANGES 30     /* passes of the active set method in one quadratic program */
+#define MAX_SINGLE 10      /* of which with a single change each */
+#define MAX_BARRIER 80     /* iterations of the interior point method that takes over */
+#define INTERIOR 1e-11     /* its complementarity, relative */
 #define PIVOT 1e-13        /* a pivot this small against its diagonal is zero */
 #define STIFFNESS 1e6      /* springs against typical curvature of the states */
 #define MAX_CORRECTIONS 12
@@ -77,8 +81,11 @@ typedef struct {
   double *low, *high;      /* flat, relative to the point, scaled */
   double *inverse;         /* (nx + nw + nb + np) reciprocal scales in flat order */
   double *d, *z, *spring, *force; /* flat: step, multipliers, springs, gradients of springs */
+  double *z_low, *z_high, *s_low, *s_high, *start; /* flat: interior point multipliers, slacks, last step */
+  double *barrier_spring, *barrier_force;          /* flat */
+  int barrier;             /* the interior point method is at work */
   double *lambda;          /* (N, nx) */
-  int8_t *active, *candidate, *cautious;
+  int8_t *active, *candidate, *cautious, *kept;
   uint8_t *fixed;
   double *scratch_y;       /* nx + q ny + Jacobian of one slot for compiled functions, and n0 x n0 */
   model a, b;
@@ -142,6 +149,13 @@ static size_t lay_out(core *k, char *scratch, const ctmhe_stage *s, int slots, i
   k->z = DOUBLES(&memory, k->nf);
   k->spring = DOUBLES(&memory, k->nf);
   k->force = DOUBLES(&memory, k->nf);
+  k->z_low = DOUBLES(&memory, k->nf);
+  k->z_high = DOUBLES(&memory, k->nf);
+  k->s_low = DOUBLES(&memory, k->nf);
+  k->s_high = DOUBLES(&memory, k->nf);
+  k->start = DOUBLES(&memory, k->nf);
+  k->barrier_spring = DOUBLES(&memory, k->nf);
+  k->barrier_force = DOUBLES(&memory, 3 * k->nf); /* and the centring terms */
   k->lambda = DOUBLES(&memory, N * nx);
   k->scratch_y = DOUBLES(&memory, nx + qy + (nx + qy) * n0 + n0 * n0);
   lay_out_model(&k->a, &memory, N, nx, nw, all, qy, n, (size_t)nb);
@@ -152,6 +166,7 @@ static size_t lay_out(core *k, char *scratch, const ctmhe_stage *s, int slots, i
   k->active = take(&memory, k->nf);
   k->candidate = take(&memory, k->nf);
   k->cautious = take(&memory, k->nf);
+  k->kept = take(&memory, k->nf);
   return memory.used;
 }
 
@@ -167,6 +182,10 @@ void ctmhe_sizes(int *nx, int *nw, int *np, int *ny, int *q, int *version) {
   *nx = *nw = *np = *ny = *q = 0;
 #endif
   *version = CTMHE_CORE_VERSION;
+}
+
+static void copy(double *to, const double *from, size_t count) {
+  if (count) memcpy(to, from, sizeof(double) * count);
 }
 
 /* ---- The model ---------------------------------------------------------------------------------------------- */
@@ -591,6 +610,10 @@ INLINE int backward_sized(core *k, const model *m, int from, int right_hand_side
           q[nw + i] = k->z[at] - stiff * (k->active[at] < 0 ? k->low[at] : k->high[at]);
         }
       }
+      if (k->barrier) {
+        q[nw + i] += right_hand_side ? (k->active[at] ? 0.0 : k->force[at]) : k->barrier_force[at];
+        stiff += k->barrier_spring[at];
+      }
       if (!right_hand_side) {
         const double weight = stiff + k->damping;
         U[(nw + i) * n + nw + i] = k->plain ? weight : sqrt(weight);
@@ -649,6 +672,26 @@ INLINE int backward_sized(core *k, const model *m, int from, int right_hand_side
             for (int b = a; b < n; b++) U[a * n + b] += stiff * row[a] * row[b];
         }
         for (int l = 0; l < n; l++) q[l] += row[l] * force;
+      }
+    }
+    if (k->barrier) {
+      const double *push = right_hand_side ? k->force : k->barrier_force;
+      for (int i = 0; i < nx + nw + (slot ? 0 : np); i++) {
+        const size_t at = i < nw        ? k->fw + (size_t)(slot * nw + i)
+                          : i < nw + nx ? (size_t)(slot * nx + i - nw)
+                                        : k->fp + (size_t)(i - nw - nx);
+        if (k->active[at]) continue;
+        q[i] += push[at];
+        if (!right_hand_side) U[i * n + i] += k->barrier_spring[at];
+      }
+      for (int i = 0; i < nb; i++) {
+        const size_t at = k->fy + (size_t)(slot * nb + i);
+        const double *row = J + (nx + i) * n, stiff = k->barrier_spring[at];
+        if (k->active[at]) continue;
+        for (int l = 0; l < n; l++) q[l] += row[l] * push[at];
+        if (!right_hand_side && stiff > 0.0)
+          for (int a = 0; a < n; a++)
+            for (int b = a; b < n; b++) U[a * n + b] += stiff * row[a] * row[b];
       }
     }
     if (!right_hand_side) {
@@ -859,6 +902,11 @@ static void adjoint(core *k, const model *m) {
 
 /* ---- The quadratic program with its bounds ------------------------------------------------------------------ */
 
+/* Whether a held bound is a spring (else it is substituted). */
+static int sprung(const core *k, size_t at) {
+  return (at >= (size_t)NX(k->s) && at < k->fw) || (at >= k->fy && at < k->fp);
+}
+
 static int slot_of(const core *k, size_t at) {
   if (at < k->fw) return (int)(at / (size_t)NX(k->s));
   if (at < k->fy) return (int)((at - k->fw) / (size_t)NW(k->s));
@@ -973,14 +1021,166 @@ static int adopt(core *k, const int8_t *set) {
   return last;
 }
 
-/* Solve the quadratic program at m from the active set at hand. */
-static int solve_program(core *k, const model *m, int *factorizations) {
+/* Largest step for which slacks and multipliers keep their sign; `ds`, `dz` follow from the step of d. */
+static double step_to_boundary(const core *k, double *complementarity, double alpha_given, double *count) {
+  double alpha = 1.0, total = 0.0, number = 0.0;
+  const int measure = alpha_given > 0.0;
+  for (size_t at = 0; at < k->nf; at++) {
+    if (k->active[at]) continue;
+    for (int side = 0; side < 2; side++) {
+      const double bound = side ? k->high[at] : k->low[at], s = side ? k->s_high[at] : k->s_low[at];
+      const double z = side ? k->z_high[at] : k->z_low[at];
+      if (!(fabs(bound) < HUGE_VAL)) continue;
+      const double ds = (side ? bound - k->d[at] : k->d[at] - bound) - s;
+      const double centre = side ? k->barrier_force[k->nf + at] : k->barrier_force[2 * k->nf + at];
+      const double dz = centre - z - z / s * ds;
+      if (measure) {
+        total += (s + alpha_given * ds) * (z + alpha_given * dz);
+        number += 1.0;
+      } else {
+        if (s + alpha * ds < 0.0) alpha = -s / ds;
+        if (z + alpha * dz < 0.0) alpha = -z / dz;
+      }
+    }
+  }
+  if (measure) {
+    *complementarity = total / (number > 0.0 ? number : 1.0);
+    *count = number;
+  }
+  return alpha;
+}
+
+static double spring_constant(const core *k, const model *m);
+
+/* Mehrotra's predictor-corrector on all bounds that are not equalities; leaves the active set it finds. */
+static int interior_point(core *k, const model *m, int *factorizations) {
+  const size_t nf = k->nf;
+  double *centre_high = k->barrier_force + nf, *centre_low = centre_high + nf;
+  const double curvature = spring_constant(k, m) / STIFFNESS;
+  k->stiffness = STIFFNESS * curvature;
+  for (size_t at = 0; at < nf; at++) {
+    k->active[at] = k->fixed[at] ? 1 : 0;
+    k->z[at] = k->barrier_spring[at] = k->barrier_force[at] = 0.0;
+    if (!(k->low[at] <= k->high[at])) return INCONSISTENT;
+  }
+  k->barrier = 0;
+  int status = backward(k, m, k->N, 0);
+  *factorizations += 1;
+  if (status) return status;
+  forward(k, m, 0);
+  double violation = 0.0;
+  for (size_t at = 0; at < nf; at++) {
+    if (k->low[at] - k->d[at] > violation) violation = k->low[at] - k->d[at];
+    if (k->d[at] - k->high[at] > violation) violation = k->d[at] - k->high[at];
+  }
+  const double least = 0.1 * (violation > 1e-3 ? violation : 1e-3), scale = curvature * least * least;
+  for (size_t at = 0; at < nf; at++) {
+    const double low = k->d[at] - k->low[at], high = k->high[at] - k->d[at];
+    k->s_low[at] = low > least ? low : least;
+    k->s_high[at] = high > least ? high : least;
+    k->z_low[at] = low < HUGE_VAL ? scale / k->s_low[at] : 0.0;
+    k->z_high[at] = high < HUGE_VAL ? scale / k->s_high[at] : 0.0;
+  }
+  k->barrier = 1;
+  status = INCONSISTENT;
+  for (int iteration = 0; iteration < MAX_BARRIER; iteration++) {
+    double mu = 0.0, count = 0.0, infeasible = 0.0;
+    for (size_t at = 0; at < nf; at++) {
+      k->start[at] = k->d[at];
+      k->barrier_spring[at] = k->barrier_force[at] = centre_low[at] = centre_high[at] = 0.0;
+      if (k->active[at]) continue;
+      if (k->low[at] > -HUGE_VAL) {
+        const double stiff = k->z_low[at] / k->s_low[at];
+        const double gap = fabs(k->d[at] - k->low[at] - k->s_low[at]);
+        if (gap > infeasible) infeasible = gap;
+        k->barrier_spring[at] += stiff;
+        k->barrier_force[at] -= k->z_low[at] + stiff * k->low[at];
+        mu += k->z_low[at] * k->s_low[at], count += 1.0;
+      }
+      if (k->high[at] < HUGE_VAL) {
+        const double stiff = k->z_high[at] / k->s_high[at];
+        const double gap = fabs(k->high[at] - k->d[at] - k->s_high[at]);
+        if (gap > infeasible) infeasible = gap;
+        k->barrier_spring[at] += stiff;
+        k->barrier_force[at] += k->z_high[at] - stiff * k->high[at];
+        mu += k->z_high[at] * k->s_high[at], count += 1.0;
+      }
+    }
+    if (count == 0.0) {
+      status = OK;
+      break;
+    }
+    mu /= count;
+    if (!(mu < HUGE_VAL)) break;
+    if (iteration && mu <= INTERIOR * curvature && infeasible <= 1e-10) {
+      status = OK;
+      break;
+    }
+    *factorizations += 1;
+    const int outcome = backward(k, m, k->N, 0);
+    if (outcome) {
+      status = outcome;
+      break;
+    }
+    forward(k, m, 0);
+    double affine = 0.0;
+    double alpha = step_to_boundary(k, NULL, 0.0, NULL);
+    step_to_boundary(k, &affine, alpha, &count);
+    const double ratio = affine / mu, sigma = ratio > 0.0 ? ratio * ratio * ratio : 0.0;
+    const double target = (sigma < 1.0 ? sigma : 1.0) * mu;
+    for (size_t at = 0; at < nf; at++) {
+      k->force[at] = 0.0;
+      if (k->active[at]) continue;
+      if (k->low[at] > -HUGE_VAL) {
+        const double s = k->s_low[at], z = k->z_low[at], ds = k->d[at] - k->low[at] - s, dz = -z - z / s * ds;
+        centre_low[at] = (target - ds * dz) / s;
+        k->force[at] -= centre_low[at];
+      }
+      if (k->high[at] < HUGE_VAL) {
+        const double s = k->s_high[at], z = k->z_high[at], ds = k->high[at] - k->d[at] - s, dz = -z - z / s * ds;
+        centre_high[at] = (target - ds * dz) / s;
+        k->force[at] += centre_high[at];
+      }
+    }
+    backward(k, m, k->N, 1);
+    forward(k, m, 1);
+    alpha = step_to_boundary(k, NULL, 0.0, NULL);
+    if (!(alpha > 1e-12)) break;
+    if (alpha < 1.0) alpha *= 0.995;
+    for (size_t at = 0; at < nf; at++) {
+      if (k->active[at]) {
+        k->z[at] += k->spring[at] * (k->d[at] - k->high[at]) * (sprung(k, at) ? 1.0 : 0.0);
+      } else {
+        if (k->low[at] > -HUGE_VAL) {
+          const double s = k->s_low[at], z = k->z_low[at], ds = k->d[at] - k->low[at] - s;
+          k->s_low[at] += alpha * ds;
+          k->z_low[at] += alpha * (centre_low[at] - z - z / s * ds);
+        }
+        if (k->high[at] < HUGE_VAL) {
+          const double s = k->s_high[at], z = k->z_high[at], ds = k->high[at] - k->d[at] - s;
+          k->s_high[at] += alpha * ds;
+          k->z_high[at] += alpha * (centre_high[at] - z - z / s * ds);
+        }
+      }
+      k->d[at] = k->start[at] + alpha * (k->d[at] - k->start[at]);
+    }
+  }
+  k->barrier = 0;
+  if (status) return status;
+  for (size_t at = 0; at < nf; at++) {
+    if (k->fixed[at]) continue;
+    const int low = k->low[at] > -HUGE_VAL && k->z_low[at] > curvature * k->s_low[at];
+    const int high = k->high[at] < HUGE_VAL && k->z_high[at] > curvature * k->s_high[at];
+    k->active[at] = (int8_t)(low && !(high && k->z_high[at] > k->z_low[at]) ? -1 : high);
+    k->z[at] = k->active[at] < 0 ? -k->z_low[at] : k->active[at] > 0 ? k->z_high[at] : 0.0;
+  }
+  return OK;
+}
+
+/* The active set method from the set at hand. */
+static int active_set(core *k, const model *m, int *factorizations) {
   uint64_t seen[MAX_CHANGES];
   int count = 0, single = 0, have_cautious = 0, from = k->N;
-  if (!k->bounded) {
-    *factorizations += 1;
-    return equality_constrained(k, m, k->N);
-  }
   for (int pass = 0; pass < MAX_CHANGES; pass++) {
     *factorizations += 1;
     const double stiffness = k->stiffness;
@@ -1001,16 +1201,36 @@ static int solve_program(core *k, const model *m, int *factorizations) {
     for (int i = 0; i < count && !single; i++) single = seen[i] == key;
     seen[count++] = key;
     have_cautious = 1;
+    if (single && ++single > MAX_SINGLE) break;
     adopt(k, single ? k->cautious : k->candidate);
   }
   return INCONSISTENT;
 }
 
-/* ---- The outer iteration ------------------------------------------------------------------------------------ */
-
-static void copy(double *to, const double *from, size_t count) {
-  if (count) memcpy(to, from, sizeof(double) * count);
+/* Solve the quadratic program at m: active set, and where that does not settle, interior point and active set. */
+static int solve_program(core *k, const model *m, int *factorizations) {
+  k->barrier = 0;
+  if (!k->bounded) {
+    *factorizations += 1;
+    return equality_constrained(k, m, k->N);
+  }
+  int status = active_set(k, m, factorizations);
+  if (status != INCONSISTENT) return status;
+  status = interior_point(k, m, factorizations);
+  if (status) return status;
+  memcpy(k->kept, k->active, k->nf); /* the point itself, should its set have bounds that depend on each other */
+  copy(k->s_low, k->d, k->nf);
+  copy(k->s_high, k->z, k->nf);
+  status = active_set(k, m, factorizations);
+  if (status != INCONSISTENT) return status;
+  memcpy(k->active, k->kept, k->nf);
+  copy(k->d, k->s_low, k->nf);
+  copy(k->z, k->s_high, k->nf);
+  adjoint(k, m);
+  return OK;
 }
+
+/* ---- The outer iteration ------------------------------------------------------------------------------------ */
 
 INLINE double clip(double value, double low, double high) {
   return value < low ? low : value > high ? high : value; /* a NaN stays */
