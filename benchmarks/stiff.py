@@ -2,9 +2,9 @@
 
     python -m benchmarks.stiff
 
-The truth is the model itself, undisturbed, from (2, 0); its position is sampled every 20 s with uniform noise of 1e-3 for
-60 s. Prints the error of the estimate, of the open-loop prediction 10 s ahead (what an event-triggered estimator lives on
-between samples), and the time of one converged solve (the faster of 2).
+The truth is the model itself, undisturbed, from (2, 0); its position is sampled every 20 s with uniform noise of 1e-3
+for 60 s. Prints the error of the estimate, of the open-loop prediction 10 s ahead (what an event-triggered estimator
+lives on between samples), and the time of one converged solve (the faster of 2).
 """
 
 from __future__ import annotations

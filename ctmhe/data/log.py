@@ -54,12 +54,10 @@ class Log:
         """Time of the newest row, -inf when empty."""
         return self._shared.times[self._stop - 1] if len(self) else -np.inf
 
-    def find(self, t: float, tolerance: float = 0.0) -> tuple[float, Array] | None:
-        """Return time and row of the first entry within `tolerance` seconds of `t`, or None."""
-        i = bisect_left(self._shared.times, t - tolerance, self._start, self._stop)
-        if i < self._stop and self._shared.times[i] <= t + tolerance:
-            return self._shared.times[i], self._shared.rows[i]
-        return None
+    def find(self, t: float) -> Array | None:
+        """Return the row at exactly `t`, or None."""
+        i = bisect_left(self._shared.times, t, self._start, self._stop)
+        return self._shared.rows[i] if i < self._stop and self._shared.times[i] == t else None
 
     def put(self, t: float, row: Array) -> Log:
         """Return a log that also holds `row` at `t`, in place of a row at exactly the same time."""

@@ -240,9 +240,8 @@ class MHE:
         if not np.isfinite(row).any():
             return state
         self._check_step(t, "measurement")
-        found = state.measurements.find(t, self._slack(t))
-        if found is not None:
-            t, known = found
+        known = state.measurements.find(t)
+        if known is not None:
             conflict = np.isfinite(known) & np.isfinite(row) & (known != row)
             if conflict.any():
                 i = int(np.flatnonzero(conflict)[0])

@@ -222,14 +222,17 @@ class Assembly:
         for i, share in enumerate(stage.weights):
             weight = np.sqrt(mesh.h * share * np.exp(-self.rate * (end - times[:, i])))
             L_y[:, i] = weight[:, None, None] * self.R.roots(times[:, i], known[:, i])
+        count = np.zeros((n, ny))
+        y_data[:, -1, ~self.held] = 0.0
         sample, edge = point_rows(records.y_times, mesh.t, mesh.tolerance)
         if mesh.h[0] == 0.0:  # the samples at the window's start belong to the end of the slot of no length
             edge = np.maximum(edge, 1)
         for i, e in zip(sample, edge, strict=True):
             row = np.isfinite(records.y[i])
             spoken = row & ~self.held
-            if e > 0 and spoken.any():
-                y_data[e - 1, -1, spoken] = records.y[i, spoken]
+            if e > 0 and spoken.any():  # samples of one instant (to round-off) count together: their mean, so often
+                count[e - 1, spoken] += 1
+                y_data[e - 1, -1, spoken] += (records.y[i] - y_data[e - 1, -1])[spoken] / count[e - 1, spoken]
                 known[e - 1, -1, spoken] = end_known[e - 1, spoken] = True
             if e == n and (row & self.held).any():  # a held sensor that speaks at the very end
                 y_data[n - 1, -1, row & self.held] = records.y[i, row & self.held]
@@ -237,7 +240,8 @@ class Assembly:
         spoken = np.flatnonzero(known[:, -1].any(axis=1))
         if len(spoken):
             weight = np.sqrt(np.exp(-self.rate * (end - mesh.t[1:][spoken])))
-            L_y[spoken, -1] = weight[:, None, None] * self.R_point.roots(mesh.t[1:][spoken], known[spoken, -1])
+            roots = self.R_point.roots(mesh.t[1:][spoken], known[spoken, -1])
+            L_y[spoken, -1] = weight[:, None, None] * roots * np.sqrt(count[spoken])[:, None, :]
         if self.S is not None and end_known[-1].any():
             terminal = self.S.root(end, end_known[-1])
             L_y[-1, -1] = square_root(L_y[-1, -1].T @ L_y[-1, -1] + terminal.T @ terminal)

@@ -516,7 +516,7 @@ INSTANTS = oscillator_mhe(hold="point")
 
 @pytest.mark.parametrize("source", ["Python", "FMU"])
 def test_cvodes_estimates_a_stiff_plant_where_rk4_of_equal_cost_cannot_even_predict(source):
-    """Van der Pol, mu = 100, sampled every 20 s: CVODES finds the state; RK4 with 400 steps a cell diverges from the truth.
+    """Van der Pol, mu = 100, sampled every 20 s: CVODES finds the state, RK4 with 400 steps a cell diverges.
 
     Costs side by side: `python -m benchmarks.stiff`.
     """

@@ -199,6 +199,16 @@ def test_a_linear_input_is_interpolated_to_the_next_known_one():
     assert mhe.predict(state, 0.75).x[0] == pytest.approx(0.75**2 / 2, rel=1e-9)
 
 
+def test_samples_of_one_instant_count_together(rng):
+    """Two samples closer than round-off of the interval weigh like the same two a microsecond apart."""
+    mhe, found = MHES["point"], []
+    for gap in (2e-12, 1e-6):
+        state = feed(mhe, mhe.init(x=[1, 0]), [0.5, 0.5 + gap], [[1.0, 0.3], [2.0, 0.1]])
+        found.append(mhe.estimate(state, 0.8)[1])
+    np.testing.assert_allclose(found[0].x, found[1].x, atol=1e-5)
+    np.testing.assert_allclose(found[0].covariance, found[1].covariance, atol=1e-5)
+
+
 def test_discounting_weighs_the_past_less():
     """With eta = 1 an old outlier pulls the estimate more than with eta = 0.1."""
     pulls = []
