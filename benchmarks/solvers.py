@@ -270,7 +270,7 @@ def main(arguments: Sequence[str] | None = None) -> list[dict[str, Any]]:
         print(f"\n{name}: {count} updates, {repeats} repeats, bounds active in {share:.0%} of the windows", flush=True)
         print(table(new), flush=True)
         if options.json:
-            options.json.write_text(json.dumps(rows, indent=1) + "\n")
+            options.json.write_text("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
     for fit in exponents(rows):
         kind = f"{fit['tool']}{' compiled' if fit['compiled'] else ''}, {fit['mode']}"
         print(

@@ -19,6 +19,7 @@ from ctmhe.types import Array
 ARMIJO = 1e-4
 DAMPING_START, DAMPING_LIMIT = 1e-8, 1e8
 ROUND_OFF = 1e-15
+SETTLED = 25  # iterations after which the penalty only grows
 MEMORY = 4  # iterates that the merit function may fall back on
 SLOW = 0.05  # predicted decreases that shrink by less than this factor call for second derivatives
 
@@ -103,9 +104,9 @@ class GaussNewton:
             factorizations += step.factorizations
             active = step.active
             predicted, optimality = self._model_decrease(qp, step)
-            rho = max(
-                rho, 1.5 * float(np.abs(step.dynamics).max(initial=0.0)), 1.5 * float(np.abs(step.zy).max(initial=0.0))
-            )
+            duals = max(float(np.abs(part).max(initial=0.0)) for part in (step.dynamics, step.zy))
+            # the first multipliers may be far too large: the penalty may follow them down, but not for ever
+            rho = 1.5 * duals if iteration <= SETTLED else max(rho, 1.5 * duals)
             if damping == 0.0 and self._feasible(current) and _largest(step) <= 100 * self.stage.accuracy:
                 message, success = "converged to the accuracy of the integrator", True
                 break
