@@ -104,7 +104,11 @@ def failures(rows: Rows) -> list[str]:
         if row["note"]:
             where = seen.setdefault(f"{title(row)}, {row['mode']}: {row['note']}", [])
             where.append(row["problem"])
-    return [f"- {text} ({', '.join(dict.fromkeys(where))})" for text, where in seen.items()]
+    every = {row["problem"] for row in rows}
+    return [
+        f"- {text} ({'every problem' if every == set(where) else ', '.join(dict.fromkeys(where))})"
+        for text, where in seen.items()
+    ]
 
 
 def bars(rows: Rows, path: Path) -> None:

@@ -16,7 +16,8 @@ from ctmhe.estimators.priors import Piece, filtering_prior, trajectory_at
 from ctmhe.estimators.state import State, frozen_set, load_state, save_state
 from ctmhe.models.continuous import Model
 from ctmhe.models.signals import Signals
-from ctmhe.solvers.base import Solution
+from ctmhe.solvers.base import Solution, Solver
+from ctmhe.solvers.compiled import compiled_solver
 from ctmhe.solvers.gauss_newton import GaussNewton
 from ctmhe.solvers.ipopt import Ipopt
 from ctmhe.solvers.ladder import climb
@@ -94,6 +95,10 @@ class MHE:
     longest_wait : float, optional
         The longest wait between estimates, if declared; must be shorter than the horizon (3.19).
     solver : {"gauss-newton", "ipopt"}
+    compile : {"off", "auto"}
+        `auto` runs Gauss-Newton in the compiled core, together with the model's functions where a C compiler is found
+        (once per model, cached on disk) and these can be generated, else with CasADi's virtual machine; `off` (the
+        default while the core is young) runs it in NumPy.
     max_iterations : int
     clock : callable, optional
         Seconds, for `Estimate.seconds`.
@@ -120,6 +125,7 @@ class MHE:
         filtering: bool = False,
         longest_wait: float | None = None,
         solver: str = "gauss-newton",
+        compile: str = "off",
         max_iterations: int = 50,
         clock: Callable[[], float] = time.perf_counter,
     ):
@@ -174,7 +180,11 @@ class MHE:
         )
         self._gauss_newton = GaussNewton(self.stage, max_iterations=max_iterations)
         self._reference = Ipopt(self.stage)
-        self._solver = self._gauss_newton if solver == "gauss-newton" else self._reference
+        if compile not in ("off", "auto"):
+            raise InputError(f"compile must be 'off' or 'auto', got {compile!r}")
+        self._solver: Solver = self._gauss_newton if solver == "gauss-newton" else self._reference
+        if solver == "gauss-newton" and compile == "auto":
+            self._solver = compiled_solver(self.stage, max_iterations=max_iterations) or self._gauss_newton
         self._silent = np.zeros(len(model.w))
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -361,32 +371,29 @@ class MHE:
             )
         return times, rows
 
-    def _guesses(self, state: State, window: Window) -> list[tuple[str, Guess]]:
+    def _guesses(self, state: State, window: Window) -> list[tuple[str, Callable[[], Guess]]]:
         """Return the warm start (the last solution on the new mesh, carried forward) and the prior carried forward."""
-        nx = self.stage.nx
-        guesses: list[tuple[str, Guess]] = []
-        if state.window is not None:
-            guess = self._warm_start(state, window)
-            if guess is not None:
-                guesses.append(("warm start", guess))
-        x0 = np.clip(window.prior[:nx], window.x_lower[0], window.x_upper[0])
-        try:
-            shifted = rollout(self.stage, window, x0, window.prior[nx:])
-        except FloatingPointError:
-            shifted = None
-        if shifted is None or not np.isfinite(shifted.x).all():
-            n = len(window.mesh)
-            shifted = Guess.of(np.tile(x0, (n + 1, 1)), np.zeros((n, self.stage.nw)), window.prior[nx:], self.stage.ny)
-        guesses.append(("shifted guess", shifted))
+        guesses: list[tuple[str, Callable[[], Guess]]] = [("shifted guess", lambda: self._shifted_guess(window))]
+        if state.window is not None and state.window.t[-1] >= window.mesh.t[0]:
+            guesses.insert(0, ("warm start", lambda: self._warm_start(state, window)))
         return guesses
 
-    def _warm_start(self, state: State, window: Window) -> Guess | None:
+    def _shifted_guess(self, window: Window) -> Guess:
+        nx, n = self.stage.nx, len(window.mesh)
+        x0 = np.clip(window.prior[:nx], window.x_lower[0], window.x_upper[0])
+        try:
+            guess = rollout(self.stage, window, x0, window.prior[nx:])
+            if np.isfinite(guess.x).all():
+                return guess
+        except FloatingPointError:
+            pass
+        return Guess.of(np.tile(x0, (n + 1, 1)), np.zeros((n, self.stage.nw)), window.prior[nx:], self.stage.ny)
+
+    def _warm_start(self, state: State, window: Window) -> Guess:
         last, mesh, stage = state.window, window.mesh, self.stage
         assert last is not None
         n = len(mesh)
         old = int(np.searchsorted(mesh.t, last.t[-1], side="right"))  # nodes that the last window covers
-        if old == 0:
-            return None
         x = np.empty((n + 1, stage.nx))
         for i in range(stage.nx):
             x[:old, i] = np.interp(mesh.t[:old], last.t, last.x[:, i])
@@ -401,7 +408,7 @@ class MHE:
             for k in range(max(old - 1, 0), n):
                 x[k + 1], _ = stage.step(mesh.t[k], mesh.h[k], x[k], w[k], p, window.u0[k], window.u1[k])
         except FloatingPointError:
-            return None
+            return self._shifted_guess(window)
         node = np.clip(np.searchsorted(last.t, mesh.t - mesh.tolerance), 0, len(last.x) - 1)
         covered = (mesh.t <= last.t[-1] + mesh.tolerance)[:, None]
         x_active, w_active, y_active, p_active = state.active

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import logging
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -14,9 +15,12 @@ import numpy as np
 
 from ctmhe.errors import SolverError
 from ctmhe.solvers.base import Multipliers, Solution, clip_to_bounds
+from ctmhe.solvers.codegen import shipped_core, specialised_core
 from ctmhe.transcription.problem import Guess, Window
 from ctmhe.transcription.stage import StageFunction
 from ctmhe.types import Array
+
+logger = logging.getLogger(__name__)
 
 VERSION = 1
 MAX_ARGUMENTS = 64
@@ -141,6 +145,19 @@ class CompiledGaussNewton:
             NO_DECREASE: "no step decreases the merit function",
             SINGULAR: "no consistent set of active bounds, or a direction without curvature",
         }[stop]
+
+
+def compiled_solver(stage: StageFunction, *, max_iterations: int) -> CompiledGaussNewton | None:
+    """Return the solver in the fastest core that can be had for `stage`; None, with the reason logged, without any."""
+    library = specialised_core(stage) or shipped_core()
+    if library is None:
+        logger.info("no compiled core: neither a built one nor a C compiler was found")
+        return None
+    try:
+        return CompiledGaussNewton(stage, library, max_iterations=max_iterations)
+    except (OSError, SolverError) as error:
+        logger.warning("the compiled core %s cannot be used: %s", library, error)
+        return None
 
 
 class _Memory:

@@ -19,7 +19,7 @@ def climb(
     window: Window,
     solver: Solver,
     reference: Callable[[], Solver],
-    guesses: Sequence[tuple[str, Guess]],
+    guesses: Sequence[tuple[str, Callable[[], Guess]]],
     notes: tuple[str, ...],
 ) -> tuple[Solution | None, Status]:
     """Try each rung until one succeeds.
@@ -31,8 +31,8 @@ def climb(
         The solver of choice.
     reference : callable returning a Solver
         The reference solver, built only when needed.
-    guesses : sequence of (name, Guess)
-        Warm start first, then the shifted guess (the prior carried forward).
+    guesses : sequence of (name, function returning a Guess)
+        Warm start first, then the shifted guess (the prior carried forward); made when their turn comes.
     notes : tuple of str
         Facts about the window for the status.
 
@@ -52,16 +52,17 @@ def climb(
             logger.debug("rung failed: %s", rungs[-1])
         return solution
 
-    for name, guess in guesses:
-        solution = run(name, solver, window, guess)
+    for name, make in guesses:
+        solution = run(name, solver, window, make())
         if solution.success:
             return solution, _status(Outcome.SOLVED, solution, rungs, notes)
         attempts.append(solution)
+    guess = guesses[-1][1]()
     usable = [a for a in attempts if np.isfinite(a.cost)]
-    start = min(usable, key=lambda a: a.feasibility + a.cost * 1e-12).point if usable else guesses[-1][1]
+    start = min(usable, key=lambda a: a.feasibility + a.cost * 1e-12).point if usable else guess
     if solver.name != reference().name:
-        for guess in (start, guesses[-1][1]):
-            solution = run("reference", reference(), window, guess)
+        for point in (start, guess):
+            solution = run("reference", reference(), window, point)
             if solution.success:
                 return solution, _status(Outcome.FALLBACK, solution, rungs, notes)
             attempts.append(solution)
@@ -71,7 +72,7 @@ def climb(
         return best, _status(Outcome.ITERATION_LIMIT, best, rungs, notes)
     relaxed = window.relaxed()
     for use in (solver, reference()):
-        solution = run("relaxed bounds", use, relaxed, guesses[-1][1])
+        solution = run("relaxed bounds", use, relaxed, guess)
         if solution.success:
             violation = bound_violation(window, solution.point, solution.y[:, -1])
             status = _status(Outcome.RELAXED, solution, rungs, notes)

@@ -222,21 +222,21 @@ class Assembly:
         for i, share in enumerate(stage.weights):
             weight = np.sqrt(mesh.h * share * np.exp(-self.rate * (end - times[:, i])))
             L_y[:, i] = weight[:, None, None] * self.R.roots(times[:, i], known[:, i])
-        count = np.zeros((n, ny))
-        y_data[:, -1, ~self.held] = 0.0
         sample, edge = point_rows(records.y_times, mesh.t, mesh.tolerance)
         if mesh.h[0] == 0.0:  # the samples at the window's start belong to the end of the slot of no length
             edge = np.maximum(edge, 1)
-        for i, e in zip(sample, edge, strict=True):
-            row = np.isfinite(records.y[i])
-            spoken = row & ~self.held
-            if e > 0 and spoken.any():  # samples of one instant (to round-off) count together: their mean, so often
-                count[e - 1, spoken] += 1
-                y_data[e - 1, -1, spoken] += (records.y[i] - y_data[e - 1, -1])[spoken] / count[e - 1, spoken]
-                known[e - 1, -1, spoken] = end_known[e - 1, spoken] = True
-            if e == n and (row & self.held).any():  # a held sensor that speaks at the very end
-                y_data[n - 1, -1, row & self.held] = records.y[i, row & self.held]
-                end_known[n - 1, row & self.held] = True
+        rows = records.y[sample]
+        count, total = np.zeros((n, ny)), np.zeros((n, ny))
+        at, sensor = np.nonzero(np.isfinite(rows) & ~self.held & (edge > 0)[:, None])
+        np.add.at(count, (edge[at] - 1, sensor), 1.0)
+        np.add.at(total, (edge[at] - 1, sensor), rows[at, sensor])
+        point = count > 0  # samples of one instant (to round-off) count together: their mean, so often
+        y_data[:, -1] = np.where(point, total / np.maximum(count, 1.0), np.where(self.held, y_data[:, -1], 0.0))
+        known[:, -1] |= point
+        end_known |= point
+        at, sensor = np.nonzero(np.isfinite(rows) & self.held & (edge == n)[:, None])  # held ones that speak at the end
+        y_data[n - 1, -1, sensor] = rows[at, sensor]
+        end_known[n - 1, sensor] = True
         spoken = np.flatnonzero(known[:, -1].any(axis=1))
         if len(spoken):
             weight = np.sqrt(np.exp(-self.rate * (end - mesh.t[1:][spoken])))
@@ -251,10 +251,9 @@ class Assembly:
         n, ny = len(mesh), self.stage.ny
         y_data, known = np.zeros((n, 1, ny)), np.zeros((n, ny), dtype=bool)
         sample, edge = point_rows(records.y_times, mesh.t[:-1], mesh.tolerance)
-        for i, k in zip(sample, edge, strict=True):
-            row = np.isfinite(records.y[i])
-            y_data[k, 0, row] = records.y[i, row]
-            known[k, row] = True
+        at, sensor = np.nonzero(np.isfinite(records.y[sample]))
+        y_data[edge[at], 0, sensor] = records.y[sample[at], sensor]
+        known[edge[at], sensor] = True
         weight = np.sqrt(self._step_weights(mesh, end))
         L_y = weight[:, None, None] * self.R.roots(mesh.t[:-1], known)
         if self.S is not None and known[-1].any() and mesh.h[-1] == 0:

@@ -56,7 +56,7 @@ def window_of(mhe: MHE, state, end: float) -> tuple[Window, Guess]:
     start = max(end - mhe.horizon, 0.0)
     records = mhe._records(state, end, start)
     window = mhe.assembly.window(start, end, records, prior, growing=end <= mhe.horizon, prior_factor=factor)
-    return window, mhe._guesses(state, window)[-1][1]
+    return window, mhe._guesses(state, window)[-1][1]()
 
 
 def case(name: str, rng) -> tuple[MHE, Window, Guess]:
