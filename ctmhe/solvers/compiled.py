@@ -22,7 +22,7 @@ from ctmhe.types import Array
 
 logger = logging.getLogger(__name__)
 
-VERSION = 1
+VERSION = 2
 MAX_ARGUMENTS = 64
 CONVERGED, ITERATION_LIMIT, NOT_FINITE, NO_DECREASE, SINGULAR = range(5)
 STAGE_FUNCTIONS = ("ctmhe_stage_value", "ctmhe_stage_jacobian", "ctmhe_stage_curvature")
@@ -65,7 +65,7 @@ class _Window(ctypes.Structure):
 
 
 class _Options(ctypes.Structure):
-    _fields_ = [("max_iterations", _int), ("tolerance", _double)]
+    _fields_ = [("max_iterations", _int), ("tolerance", _double), ("accuracy", _double)]
 
 
 class _Result(ctypes.Structure):
@@ -118,6 +118,7 @@ class CompiledGaussNewton:
         memory.write(window, guess, n)
         options = memory.options
         options.max_iterations, options.tolerance = self.max_iterations, self.tolerance
+        options.accuracy = self.stage.accuracy
         stop = self._core.ctmhe_solve(*memory.pointers)
         result = memory.result
         if stop == NOT_FINITE:

@@ -41,6 +41,9 @@
 #define ARMIJO 1e-4
 #define DAMPING_START 1e-8
 #define DAMPING_LIMIT 1e8
+#define ROUND_OFF 1e-15
+#define SETTLED 25 /* iterations after which the penalty only grows */
+#define MEMORY 4   /* iterates that the merit function may fall back on */
 #define SLOW 0.05          /* predicted decreases that shrink by less than this factor call for second derivatives */
 #define MAX_CHANGES 30     /* passes of the active set method in one quadratic program */
 #define MAX_SINGLE 10      /* of which with a single change each */
@@ -1407,6 +1410,24 @@ static void move(const core *k, const model *from, model *to, double alpha) {
                      : from->p[i];
 }
 
+/* The predicted decrease that is small enough to stop: relative to the cost, or below round-off. */
+static double enough(const ctmhe_options *options, double cost, double data) {
+  return options->tolerance * cost + ROUND_OFF * sqrt(cost * data) + options->accuracy * options->accuracy * data;
+}
+
+/* The largest component of the step, relative to the signals' scales. */
+static double largest_step(const core *k) {
+  double largest = 0.0;
+  const size_t states = (size_t)((k->N + 1) * NX(k->s)), disturbances = (size_t)(k->N * NW(k->s));
+  for (size_t i = 0; i < states; i++)
+    if (fabs(k->d[i]) > largest) largest = fabs(k->d[i]);
+  for (size_t i = 0; i < disturbances; i++)
+    if (fabs(k->d[k->fw + i]) > largest) largest = fabs(k->d[k->fw + i]);
+  for (size_t i = 0; i < (size_t)k->np; i++)
+    if (fabs(k->d[k->fp + i]) > largest) largest = fabs(k->d[k->fp + i]);
+  return largest;
+}
+
 static double data_scale(const core *k) {
   const ctmhe_window *win = k->win;
   const int ny = NY(k->s), q = NQ(k->s), width = NX(k->s) + k->np;
@@ -1507,6 +1528,9 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
   model *current = &k->a, *trial = &k->b;
   for (int i = 0; i < (N + 1) * nx; i++) current->x[i] = clip(result->x[i], window->x_lower[i], window->x_upper[i]);
   for (int i = 0; i < N * nw; i++) current->w[i] = clip(result->w[i], window->w_lower[i], window->w_upper[i]);
+  for (int slot = 0; slot + 1 < N; slot++) /* one w for all slots of a cell */
+    if (window->shared[slot])
+      for (int i = 0; i < nw; i++) current->w[(slot + 1) * nw + i] = current->w[slot * nw + i];
   for (int i = 0; i < NP(stage); i++)
     current->p[i] = k->np ? clip(result->p[i], window->p_lower[i], window->p_upper[i]) : result->p[i];
   result->iterations = result->factorizations = 0;
@@ -1515,7 +1539,12 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
   result->cost = HUGE_VAL;
   if (linearize(k, current) || !(fabs(current->cost) < HUGE_VAL) || !(current->infeasibility < HUGE_VAL))
     return result->stop;
-  const double floor = 1e-14 * data_scale(k);
+  const double data = data_scale(k), accuracy = options->accuracy;
+  const double feasible = 10 * accuracy > 1e-8 ? 10 * accuracy : 1e-8;
+  double recent_cost[MEMORY], recent_infeasibility[MEMORY];
+  int remembered = 1, newest = 0;
+  recent_cost[0] = current->cost;
+  recent_infeasibility[0] = current->infeasibility;
   double rho = 0.0, last_decrease = NAN;
   int newton = 0, with_curvature = 0, stepped = 0, stop = CTMHE_ITERATION_LIMIT, iteration = 0;
   while (iteration < options->max_iterations) {
@@ -1555,10 +1584,19 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
     stepped = 1;
     result->optimality = k->optimality;
     const double predicted = k->decrease, force = 1.5 * largest_force(k);
-    if (force > rho) rho = force;
+    if (force > rho || iteration <= SETTLED) rho = force;
+    if (k->damping == 0.0 && current->defect <= feasible && current->excess <= feasible &&
+        largest_step(k) <= 100 * accuracy) { /* the step is below what the integrator can tell apart */
+      stop = CTMHE_CONVERGED;
+      break;
+    }
     /* a full step is likely the last: it needs no new linearisation */
-    const int last = fabs(predicted) <= options->tolerance * (current->cost > floor ? current->cost : floor);
-    const double merit = current->cost / 2 + rho * current->infeasibility;
+    const int last = fabs(predicted) <= enough(options, current->cost, data);
+    double merit = -HUGE_VAL; /* the worst of the last few: curved dynamics would cut good full steps */
+    for (int i = 0; i < remembered; i++) {
+      const double past = recent_cost[i] / 2 + rho * recent_infeasibility[i];
+      if (past > merit) merit = past;
+    }
     const double slope = -(predicted > 0.0 ? predicted : 0.0) - rho * current->infeasibility;
     const double noise = 1e-13 * (merit > 1e-300 ? merit : 1e-300);
     double alpha = 1.0;
@@ -1592,6 +1630,7 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
       }
       continue;
     }
+    const int light = k->damping <= 10 * DAMPING_START * typical; /* else the small step is the damping's doing */
     k->damping = k->damping < DAMPING_START * typical ? 0.0 : 0.1 * k->damping;
     const int slow = iteration > 4 && fabs(predicted) > SLOW * fabs(last_decrease);
     newton = stage->symbolic && alpha == 1.0 && (newton || slow);
@@ -1600,9 +1639,12 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
     trial = current;
     current = accepted_model;
     with_curvature = 0;
-    const double scale = current->cost > floor ? current->cost : floor;
-    if (fabs(predicted) <= options->tolerance * scale && alpha == 1.0 && current->defect <= 1e-8 &&
-        current->excess <= 1e-8) {
+    newest = (newest + 1) % MEMORY;
+    if (remembered < MEMORY) remembered++;
+    recent_cost[newest] = current->cost;
+    recent_infeasibility[newest] = current->infeasibility;
+    if (fabs(predicted) <= enough(options, current->cost, data) && alpha == 1.0 && light &&
+        current->defect <= feasible && current->excess <= feasible) {
       stop = CTMHE_CONVERGED;
       break;
     }

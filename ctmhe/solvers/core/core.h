@@ -17,7 +17,7 @@
 extern "C" {
 #endif
 
-#define CTMHE_CORE_VERSION 1
+#define CTMHE_CORE_VERSION 2
 #define CTMHE_MAX_ARGUMENTS 64 /* pointers a compiled stage function may use (CasADi's sz_arg, sz_res) */
 
 /* The stage function over one slot, in CasADi's own calling convention:
@@ -68,6 +68,7 @@ typedef struct {
 typedef struct {
   int max_iterations;
   double tolerance;           /* predicted decrease relative to the cost at which a full step is the last */
+  double accuracy;            /* of an evaluation, relative: round-off, or the tolerance of an adaptive integrator */
 } ctmhe_options;
 
 enum ctmhe_stop {             /* why the core stopped */
