@@ -76,7 +76,10 @@ class Signals:
             vector = np.full(n, np.nan if missing is None else missing)
             given = set()
             for name, value in values.items():
-                i = self.index(name)
+                try:
+                    i = self.index(name)
+                except InputError as error:
+                    raise InputError(f"{what}: {error}") from None
                 try:
                     vector[i] = float(value)
                 except (TypeError, ValueError):

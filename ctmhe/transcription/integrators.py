@@ -139,7 +139,7 @@ class CVODES:
         parameters = ca.vertcat(t, h, w, p, u0, u1)
         rate = h * model.dynamics(t + s * h, x * scale, u0 + s * (u1 - u0), w, p) / scale
         grid = [*self.nodes, 1.0] if signal else [1.0]
-        options = {"reltol": self.rtol, "abstol": self.atol, "max_num_steps": 100_000}
+        options = {"reltol": self.rtol, "abstol": self.atol, "max_num_steps": 10_000}
         flow = ca.integrator("flow", "cvodes", {"x": x, "t": s, "p": parameters, "ode": rate}, 0.0, grid, options)
         symbols = slot_symbols(model, ca.MX)
         t, h, x, w, p, u0, u1 = symbols
