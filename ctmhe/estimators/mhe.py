@@ -12,6 +12,7 @@ import numpy as np
 from ctmhe.data.log import Log
 from ctmhe.data.window import held_inputs
 from ctmhe.errors import InputError, NotEstimated, TooLate
+from ctmhe.estimators.guesses import open_loop, starting_points
 from ctmhe.estimators.priors import Piece, filtering_prior, trajectory_at
 from ctmhe.estimators.state import State, frozen_set, load_state, save_state
 from ctmhe.models.continuous import Model
@@ -24,7 +25,7 @@ from ctmhe.solvers.ladder import climb
 from ctmhe.transcription.assembly import Assembly, Records, hold_kinds
 from ctmhe.transcription.grid import Mesh, same_time
 from ctmhe.transcription.integrators import Integrator, StepMap
-from ctmhe.transcription.problem import Guess, Window, rollout
+from ctmhe.transcription.problem import Window
 from ctmhe.transcription.stage import StageFunction
 from ctmhe.types import (
     Array,
@@ -331,10 +332,10 @@ class MHE:
         window = self.assembly.window(start, t, records, prior, growing=growing, prior_factor=factor)
         if not window.L_y.any():
             notes = (*notes, "no measurement in window")
-        guesses = self._guesses(state, window)
+        guesses = starting_points(self.stage, state, window)
         solution, status = climb(window, self._solver, lambda: self._reference, guesses, notes)
         if solution is None:
-            solution = self._open_loop(state, window, start)
+            solution = open_loop(self.stage, state, window)
         trajectory = _trajectory(window, solution)
         estimate = self._to_estimate(window, solution, trajectory, status, began)
         return self._advance(state, estimate, solution), estimate
@@ -370,82 +371,6 @@ class MHE:
                 f"control(state, Input(t={start:g}, u=...)) first"
             )
         return times, rows
-
-    def _guesses(self, state: State, window: Window) -> list[tuple[str, Callable[[], Guess]]]:
-        """Return the warm start (the last solution on the new mesh, carried forward) and the prior carried forward."""
-        guesses: list[tuple[str, Callable[[], Guess]]] = [("shifted guess", lambda: self._shifted_guess(window))]
-        if state.window is not None and state.window.t[-1] >= window.mesh.t[0]:
-            guesses.insert(0, ("warm start", lambda: self._warm_start(state, window)))
-        return guesses
-
-    def _shifted_guess(self, window: Window) -> Guess:
-        nx, n = self.stage.nx, len(window.mesh)
-        x0 = np.clip(window.prior[:nx], window.x_lower[0], window.x_upper[0])
-        try:
-            guess = rollout(self.stage, window, x0, window.prior[nx:])
-            if np.isfinite(guess.x).all():
-                return guess
-        except FloatingPointError:
-            pass
-        return Guess.of(np.tile(x0, (n + 1, 1)), np.zeros((n, self.stage.nw)), window.prior[nx:], self.stage.ny)
-
-    def _warm_start(self, state: State, window: Window) -> Guess:
-        last, mesh, stage = state.window, window.mesh, self.stage
-        assert last is not None
-        n = len(mesh)
-        old = int(np.searchsorted(mesh.t, last.t[-1], side="right"))  # nodes that the last window covers
-        x = np.empty((n + 1, stage.nx))
-        for i in range(stage.nx):
-            x[:old, i] = np.interp(mesh.t[:old], last.t, last.x[:, i])
-        middle = mesh.t[:-1] + mesh.h / 2
-        slot = np.clip(np.searchsorted(last.t, middle, side="right") - 1, 0, len(last.w) - 1)
-        inside = (middle >= last.t[0]) & (middle <= last.t[-1])
-        w = np.where(inside[:, None], last.w[slot], 0.0)
-        for k in np.flatnonzero(mesh.shared):
-            w[k + 1] = w[k]  # the last cell goes on with its w
-        p = state.p if window.p_estimated else window.prior[stage.nx :]
-        try:
-            for k in range(max(old - 1, 0), n):
-                x[k + 1], _ = stage.step(mesh.t[k], mesh.h[k], x[k], w[k], p, window.u0[k], window.u1[k])
-        except FloatingPointError:
-            return self._shifted_guess(window)
-        node = np.clip(np.searchsorted(last.t, mesh.t - mesh.tolerance), 0, len(last.x) - 1)
-        covered = (mesh.t <= last.t[-1] + mesh.tolerance)[:, None]
-        x_active, w_active, y_active, p_active = state.active
-        return Guess(
-            x,
-            w,
-            p,
-            np.where(covered, x_active[node], 0).astype(np.int8),
-            np.where(inside[:, None], w_active[slot], 0).astype(np.int8),
-            np.where(inside[:, None], y_active[slot], 0).astype(np.int8),
-            p_active,
-        )
-
-    def _open_loop(self, state: State, window: Window, start: float) -> Solution:
-        """Return the prediction from the last estimate as a solution, when nothing else gave numbers."""
-        stage, mesh = self.stage, window.mesh
-        n = len(mesh)
-        x = np.empty((n + 1, stage.nx))
-        for k, t in enumerate(mesh.t):
-            if t <= state.t:
-                known = state.window is not None and t >= state.window.t[0]
-                x[k] = trajectory_at(stage, state.window, t) if known and state.window is not None else state.x
-            else:
-                x[k] = x[k - 1] if k else state.x
-                try:
-                    previous = max(mesh.t[k - 1] if k else start, state.t)
-                    x[k] = self.propagate(state, previous, t, state.x if previous <= state.t else x[k - 1], state.p)
-                except FloatingPointError:
-                    pass
-        broken = ~np.isfinite(x).all(axis=1)
-        x[broken] = state.x  # never keep what is not finite: the next estimate starts from here
-        point = Guess.of(x, np.zeros((n, stage.nw)), state.p, stage.ny)
-        try:
-            _, y = stage.values(mesh.t[:-1], mesh.h, x[:-1], point.w, point.p, window.u0, window.u1)
-        except FloatingPointError:
-            y = np.full((n, stage.q, stage.ny), np.nan)
-        return Solution(point, y, float("nan"), False, "open loop")
 
     def _to_estimate(
         self, window: Window, solution: Solution, trajectory: Trajectory, status: Status, began: float

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from ctmhe.estimators import MHE
+from ctmhe.estimators.guesses import shifted_guess
 from ctmhe.models.library import batch_reactor, chua, cstr, hover_speed, quadrotor, van_der_pol
 from ctmhe.transcription import CVODES, RK4
 from ctmhe.types import Bounds, DiscountedCost, Input, Measurement
@@ -110,7 +111,7 @@ def test_multipliers_have_the_sign_of_their_bound(rng):
     for k, row in enumerate(rows):
         state = mhe.observe(state, Measurement(k * 0.05, row))
     window = mhe.assembly.window(0.0, 1.0, mhe._records(state, 1.0, 0.0), np.asarray(guess, float), growing=True)
-    start = mhe._guesses(state, window)[-1][1]()
+    start = shifted_guess(mhe.stage, window)
     ours, reference = mhe._gauss_newton.solve(window, start), mhe._reference.solve(window, start)
     z = ours.multipliers.x
     held = ours.point.x_active

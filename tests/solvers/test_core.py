@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 import ctmhe.solvers
 from ctmhe.errors import SolverError
 from ctmhe.estimators import MHE
+from ctmhe.estimators.guesses import shifted_guess
 from ctmhe.models import ContinuousModel
 from ctmhe.models.library import batch_reactor
 from ctmhe.solvers.compiled import CompiledGaussNewton
@@ -56,7 +57,7 @@ def window_of(mhe: MHE, state, end: float) -> tuple[Window, Guess]:
     start = max(end - mhe.horizon, 0.0)
     records = mhe._records(state, end, start)
     window = mhe.assembly.window(start, end, records, prior, growing=end <= mhe.horizon, prior_factor=factor)
-    return window, mhe._guesses(state, window)[-1][1]()
+    return window, shifted_guess(mhe.stage, window)
 
 
 def case(name: str, rng) -> tuple[MHE, Window, Guess]:
