@@ -83,6 +83,6 @@ def build_mesh(
 
 def discounted_length(t: Array, h: Array, end: float, rate: float) -> Array:
     """Return the integral of exp(-rate (end - tau)) over each slot [t, t + h], exact and stable for small rate h."""
-    if rate == 0.0:
+    if rate < 1e-200:  # none, or so little that the product below underflows
         return h.copy()
     return np.exp(-rate * (end - t - h)) * (-np.expm1(-rate * h)) / rate

@@ -213,9 +213,7 @@ def test_simulation_agrees_with_an_independent_integration(unzipped, name, fmi, 
         output=states,
     )
     start = np.array([v.start for v in model.states])
-    true = solve_ivp(
-        lambda _, x: RHS[name](x, u, p), (0, stop), start, "DOP853", got["time"], rtol=1e-12, atol=1e-13
-    )
+    true = solve_ivp(lambda _, x: RHS[name](x, u, p), (0, stop), start, "DOP853", got["time"], rtol=1e-12, atol=1e-13)
     # co-simulation is near exact; fmpy's CVODE keeps its tolerance a step, not over the run
     tolerance = 1e-8 if kind == "CoSimulation" else 1e-6
     np.testing.assert_allclose([got[n] for n in states], true.y, rtol=tolerance, atol=tolerance)
