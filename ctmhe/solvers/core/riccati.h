@@ -1,0 +1,352 @@
+/* The sweeps over the slots: factorisation backward, step forward, multipliers backward. */
+#ifndef CTMHE_RICCATI_H
+#define CTMHE_RICCATI_H
+
+#include "dense.h"
+
+/* m += [B A E; 0 0 I]' (q + U'U c) with the value function behind the slot. */
+INLINE void pull_back(double *restrict m, const double *restrict U, const double *restrict q, const double *restrict J,
+                      const double *restrict c, double *restrict y, int plain, int o, int nx, int nw,
+                      int np) {
+  const int n = nw + nx + np;
+  for (int i = o; i < n; i++) y[i] = q[i];
+  if (c && plain) {
+    for (int i = o; i < n; i++)
+      for (int l = 0; l < nx; l++) y[i] += U[i * n + nw + l] * c[l];
+  } else if (c)
+    for (int j = o; j < nw + nx; j++) {
+      double t = 0.0;
+      for (int i = j < nw ? 0 : j - nw; i < nx; i++) t += U[j * n + nw + i] * c[i];
+      for (int i = j; i < n; i++) y[i] += U[j * n + i] * t;
+    }
+  for (int i = 0; i < nx; i++) {
+    const double a = y[nw + i];
+    for (int l = 0; l < n; l++) m[l] += a * J[i * n + l];
+  }
+  for (int i = o; i < nw; i++) m[i] += y[i];
+  for (int i = nw + nx; i < n; i++) m[i] += y[i];
+}
+
+INLINE void forward_eliminate(double *restrict m, const double *restrict U, const double *restrict D, int count,
+                              int n) {
+  for (int j = 0; j < count; j++) {
+    const double l = m[j] * D[j];
+    m[j] = l;
+    for (int i = j + 1; i < n; i++) m[i] -= U[j * n + i] * l;
+  }
+}
+
+/* Backward sweep from slot `from`: factors and gradients, or with `right_hand_side` the gradients of k->force only. */
+INLINE int backward_sized(core *k, const model *m, int from, int right_hand_side, int nx, int nw, int np) {
+  const int n = nw + nx + np, N = k->N, nb = k->nb;
+  const uint8_t *shared = k->win->shared;
+  const size_t nn = (size_t)(n * n);
+  uint8_t *skip = (uint8_t *)k->r;
+  double *floor = k->t;
+  int status = OK;
+  if (from >= N) {
+    double *U = k->U + (size_t)N * nn, *q = k->q + (size_t)N * (size_t)n;
+    for (int i = 0; i < n; i++) q[i] = 0.0;
+    if (!right_hand_side) memset(U, 0, sizeof(double) * nn);
+    for (int i = 0; i < nx; i++) {
+      const size_t at = (size_t)(N * nx + i);
+      double stiff = 0.0;
+      if (k->bounded && k->active[at]) {
+        if (right_hand_side) {
+          q[nw + i] = k->force[at];
+        } else {
+          stiff = k->spring[at] = k->stiffness;
+          q[nw + i] = k->z[at] - stiff * (k->active[at] < 0 ? k->low[at] : k->high[at]);
+        }
+      }
+      if (k->barrier) {
+        q[nw + i] += right_hand_side ? (k->active[at] ? 0.0 : k->force[at]) : k->barrier_force[at];
+        stiff += k->barrier_spring[at];
+      }
+      if (!right_hand_side) {
+        const double weight = stiff + k->damping;
+        U[(nw + i) * n + nw + i] = k->plain ? weight : sqrt(weight);
+      }
+    }
+    from = N - 1;
+  }
+  for (int slot = from; slot >= 0; slot--) {
+    const int carried = shared[slot] && slot + 1 < N, first = slot == 0 || !shared[slot - 1], o = carried ? 0 : nw;
+    double *U = k->U + (size_t)slot * nn, *D = k->D + (size_t)(slot * n), *q = k->q + (size_t)(slot * n);
+    const double *behind = U + nn, *J = m->J + (size_t)(slot * (nx + nb)) * (size_t)n;
+    const int eliminated = slot == 0 ? n : first ? nw : 0;
+    if (right_hand_side)
+      for (int i = 0; i < n; i++) q[i] = 0.0;
+    else {
+      const double *g = m->g + (size_t)(slot * n), *H = m->H + (size_t)slot * nn;
+      for (int i = 0; i < n; i++) q[i] = g[i];
+      for (size_t i = 0; i < nn; i++) U[i] = H[i];
+      if (k->plain) {
+        add_plain(U, behind, J, k->S, o, nx, nw, np);
+      } else {
+        transform(k->S, behind, J, o, nx, nw, np);
+        add_square(U, k->S + o * n, nw + nx - o, 0, n);
+        if (np) add_square(U, behind + (nw + nx) * n, np, nw + nx, n);
+      }
+    }
+    pull_back(q, behind, k->q + (size_t)((slot + 1) * n), J,
+              right_hand_side ? NULL : m->c + (size_t)(slot * nx), k->v, k->plain, o, nx, nw, np);
+    if (k->bounded) {
+      if (slot)
+        for (int i = 0; i < nx; i++) {
+          const size_t at = (size_t)(slot * nx + i);
+          if (!k->active[at]) continue;
+          if (right_hand_side) {
+            q[nw + i] += k->force[at];
+          } else {
+            k->spring[at] = k->stiffness;
+            q[nw + i] += k->z[at] - k->stiffness * (k->active[at] < 0 ? k->low[at] : k->high[at]);
+            U[(nw + i) * n + nw + i] += k->stiffness;
+          }
+        }
+      for (int i = 0; i < nb; i++) {
+        const size_t at = k->fy + (size_t)(slot * nb + i);
+        if (!k->active[at]) continue;
+        const double *row = J + (nx + i) * n;
+        double force;
+        if (right_hand_side) {
+          force = k->force[at];
+        } else {
+          double size = 0.0;
+          for (int l = 0; l < n; l++) size += row[l] * row[l];
+          const double stiff = size > 0.0 ? k->stiffness / size : 0.0;
+          k->spring[at] = stiff;
+          force = k->z[at] - stiff * (k->active[at] < 0 ? k->low[at] : k->high[at]);
+          for (int a = 0; a < n; a++)
+            for (int b = a; b < n; b++) U[a * n + b] += stiff * row[a] * row[b];
+        }
+        for (int l = 0; l < n; l++) q[l] += row[l] * force;
+      }
+    }
+    if (k->barrier) {
+      const double *push = right_hand_side ? k->force : k->barrier_force;
+      for (int i = 0; i < nx + nw + (slot ? 0 : np); i++) {
+        const size_t at = i < nw        ? k->fw + (size_t)(slot * nw + i)
+                          : i < nw + nx ? (size_t)(slot * nx + i - nw)
+                                        : k->fp + (size_t)(i - nw - nx);
+        if (k->active[at]) continue;
+        q[i] += push[at];
+        if (!right_hand_side) U[i * n + i] += k->barrier_spring[at];
+      }
+      for (int i = 0; i < nb; i++) {
+        const size_t at = k->fy + (size_t)(slot * nb + i);
+        const double *row = J + (nx + i) * n, stiff = k->barrier_spring[at];
+        if (k->active[at]) continue;
+        for (int l = 0; l < n; l++) q[l] += row[l] * push[at];
+        if (!right_hand_side && stiff > 0.0)
+          for (int a = 0; a < n; a++)
+            for (int b = a; b < n; b++) U[a * n + b] += stiff * row[a] * row[b];
+      }
+    }
+    if (!right_hand_side) {
+      if (k->damping > 0.0)
+        for (int i = 0; i < nw + nx; i++) U[i * n + i] += k->damping;
+      if (k->damping > 0.0 && slot == 0)
+        for (int i = nw + nx; i < n; i++) U[i * n + i] += k->damping;
+      for (int i = 0; i < n; i++) {
+        floor[i] = PIVOT * U[i * n + i];
+        skip[i] = 0;
+      }
+      if (k->bounded && eliminated) {
+        for (int j = 0; j < eliminated; j++) {
+          const size_t at = j < nw ? k->fw + (size_t)(slot * nw + j)
+                                   : j < nw + nx ? (size_t)(j - nw) : k->fp + (size_t)(j - nw - nx);
+          if (!k->active[at]) continue;
+          const double target = k->active[at] < 0 ? k->low[at] : k->high[at];
+          for (int i = 0; i < n; i++) q[i] += (i < j ? U[i * n + j] : U[j * n + i]) * target;
+          skip[j] = 1;
+        }
+        for (int j = 0; j < eliminated; j++)
+          if (skip[j]) {
+            for (int i = 0; i < j; i++) U[i * n + j] = 0.0;
+            for (int i = j; i < n; i++) U[j * n + i] = 0.0;
+          }
+      }
+      const int outcome =
+          k->plain ? eliminate_plain(U, D, floor, skip, eliminated, n) : cholesky(U, D, floor, skip, n);
+      if (outcome == NOT_A_NUMBER) return outcome;
+      if (outcome) status = outcome;
+    }
+    forward_eliminate(q, U, D, eliminated, n);
+  }
+  return status;
+}
+
+static int backward(core *k, const model *m, int from, int right_hand_side) {
+  if (right_hand_side) {
+    if (k->np) return backward_sized(k, m, from, 1, NX(k->s), NW(k->s), NP(k->s));
+    return backward_sized(k, m, from, 1, NX(k->s), NW(k->s), 0);
+  }
+  if (k->np) return backward_sized(k, m, from, 0, NX(k->s), NW(k->s), NP(k->s));
+  return backward_sized(k, m, from, 0, NX(k->s), NW(k->s), 0);
+}
+
+/* Solve for `count` leading variables of v, those behind them known. */
+INLINE void back_substitute(double *restrict v, const double *restrict U, const double *restrict D,
+                            const double *restrict l, int count, int n) {
+  for (int j = count - 1; j >= 0; j--) {
+    double t = l[j];
+    for (int i = j + 1; i < n; i++) t += U[j * n + i] * v[i];
+    v[j] = -t * D[j];
+  }
+}
+
+/* Forward sweep: the step (whole), or a correction added to it. */
+INLINE void forward_sized(core *k, const model *m, int correction, int nx, int nw, int np) {
+  const int n = nw + nx + np, N = k->N, nb = k->nb;
+  const uint8_t *shared = k->win->shared;
+  double *restrict v = k->v, *restrict next = k->t, *d = k->d;
+  for (int slot = 0; slot < N; slot++) {
+    const double *U = k->U + (size_t)slot * (size_t)(n * n), *D = k->D + (size_t)(slot * n),
+                 *q = k->q + (size_t)(slot * n);
+    const double *J = m->J + (size_t)(slot * (nx + nb)) * (size_t)n, *c = m->c + (size_t)(slot * nx);
+    const int first = slot == 0 || !shared[slot - 1];
+    const int eliminated = slot == 0 ? n : first ? nw : 0;
+    back_substitute(v, U, D, q, eliminated, n);
+    if (k->bounded && eliminated && !correction)
+      for (int j = 0; j < eliminated; j++) {
+        const size_t at = j < nw ? k->fw + (size_t)(slot * nw + j)
+                                 : j < nw + nx ? (size_t)(j - nw) : k->fp + (size_t)(j - nw - nx);
+        if (k->active[at]) v[j] = k->active[at] < 0 ? k->low[at] : k->high[at];
+      }
+    double *dx = d + (size_t)(slot * nx), *dw = d + k->fw + (size_t)(slot * nw), *dy = d + k->fy + (size_t)(slot * nb);
+    if (correction) {
+      for (int i = 0; i < nw; i++) dw[i] += v[i];
+      for (int i = 0; i < nx; i++) dx[i] += v[nw + i];
+      if (slot == 0)
+        for (int i = 0; i < np; i++) d[k->fp + (size_t)i] += v[nw + nx + i];
+    } else {
+      for (int i = 0; i < nw; i++) dw[i] = v[i];
+      for (int i = 0; i < nx; i++) dx[i] = v[nw + i];
+      if (slot == 0)
+        for (int i = 0; i < np; i++) d[k->fp + (size_t)i] = v[nw + nx + i];
+    }
+    for (int i = 0; i < nb; i++) {
+      double t = 0.0;
+      for (int l = 0; l < n; l++) t += J[(nx + i) * n + l] * v[l];
+      if (correction) dy[i] += t;
+      else dy[i] = t;
+    }
+    for (int i = 0; i < nx; i++) {
+      double t = correction ? 0.0 : c[i];
+      for (int l = 0; l < n; l++) t += J[i * n + l] * v[l];
+      next[i] = t;
+    }
+    for (int i = 0; i < nx; i++) v[nw + i] = next[i];
+  }
+  for (int i = 0; i < nx; i++) {
+    if (correction) d[N * nx + i] += v[nw + i];
+    else d[N * nx + i] = v[nw + i];
+  }
+}
+
+static void forward(core *k, const model *m, int correction) {
+  if (correction) {
+    if (k->np) forward_sized(k, m, 1, NX(k->s), NW(k->s), NP(k->s));
+    else forward_sized(k, m, 1, NX(k->s), NW(k->s), 0);
+  } else if (k->np) forward_sized(k, m, 0, NX(k->s), NW(k->s), NP(k->s));
+  else forward_sized(k, m, 0, NX(k->s), NW(k->s), 0);
+}
+
+/* Adjoint sweep at the step: dynamics multipliers, multipliers of the substituted bounds, predicted decrease of J/2,
+ * and how stationary the step is. */
+INLINE void adjoint_sized(core *k, const model *m, int nx, int nw, int np) {
+  const int n = nw + nx + np, N = k->N, nb = k->nb;
+  const uint8_t *shared = k->win->shared;
+  double *restrict v = k->v, *restrict r = k->r, *restrict Hv = k->t;
+  double *rw = k->S, *rp = k->S + nw, *Hp = k->S + nw + np, *gp = k->S + nw + 2 * np;
+  const double *d = k->d;
+  double slope = 0.0, curvature = 0.0, largest = 0.0, product = 0.0, residual = 0.0, force = 0.0;
+  for (int i = 0; i < nw; i++) rw[i] = 0.0;
+  for (int i = 0; i < np; i++) {
+    rp[i] = k->damping * d[k->fp + (size_t)i];
+    Hp[i] = gp[i] = 0.0;
+  }
+  for (int i = 0; i < nx; i++)
+    k->lambda[(N - 1) * nx + i] = k->damping * d[N * nx + i] + (k->bounded ? k->z[N * nx + i] : 0.0);
+  for (int slot = N - 1; slot >= 0; slot--) {
+    const double *H = m->H + (size_t)slot * (size_t)(n * n), *g = m->g + (size_t)(slot * n);
+    const double *J = m->J + (size_t)(slot * (nx + nb)) * (size_t)n, *lambda = k->lambda + (size_t)(slot * nx);
+    for (int i = 0; i < nw; i++) v[i] = d[k->fw + (size_t)(slot * nw + i)];
+    for (int i = 0; i < nx; i++) v[nw + i] = d[(size_t)(slot * nx + i)];
+    for (int i = 0; i < np; i++) v[nw + nx + i] = d[k->fp + (size_t)i];
+    for (int i = 0; i < n; i++) Hv[i] = 0.0;
+    for (int i = 0; i < n; i++) {
+      const double vi = v[i], *restrict row = H + i * n;
+      double t = row[i] * vi;
+      for (int j = i + 1; j < n; j++) {
+        t += row[j] * v[j];
+        Hv[j] += row[j] * vi;
+      }
+      Hv[i] += t;
+    }
+    for (int i = 0; i < n; i++) {
+      slope += g[i] * v[i];
+      curvature += Hv[i] * v[i];
+      r[i] = g[i] + Hv[i];
+    }
+    for (int i = 0; i < nw + nx; i++) {
+      const double a = fabs(g[i]), b = fabs(Hv[i]);
+      if (a > largest) largest = a;
+      if (b > product) product = b;
+    }
+    for (int i = 0; i < np; i++) Hp[i] += Hv[nw + nx + i], gp[i] += g[nw + nx + i];
+    for (int i = 0; i < nx; i++) {
+      const double a = lambda[i];
+      if (fabs(a) > force) force = fabs(a);
+      for (int l = 0; l < n; l++) r[l] += a * J[i * n + l];
+    }
+    if (k->damping > 0.0)
+      for (int i = 0; i < nw + nx; i++) r[i] += k->damping * v[i];
+    for (int i = 0; i < nb; i++) {
+      const double a = k->z[k->fy + (size_t)(slot * nb + i)];
+      if (a != 0.0)
+        for (int l = 0; l < n; l++) r[l] += a * J[(nx + i) * n + l];
+    }
+    for (int i = 0; i < np; i++) rp[i] += r[nw + nx + i];
+    for (int i = 0; i < nw; i++) rw[i] += r[i];
+    if (slot == 0 || !shared[slot - 1])
+      for (int i = 0; i < nw; i++) {
+        const size_t at = k->fw + (size_t)(slot * nw + i);
+        if (k->bounded && k->active[at]) k->z[at] = -rw[i];
+        else if (fabs(rw[i]) > residual) residual = fabs(rw[i]);
+        rw[i] = 0.0;
+      }
+    if (slot == 0) {
+      for (int i = 0; i < nx; i++) {
+        if (k->bounded && k->active[i]) k->z[i] = -r[nw + i];
+        else if (fabs(r[nw + i]) > residual) residual = fabs(r[nw + i]);
+      }
+    } else {
+      double *before = k->lambda + (size_t)((slot - 1) * nx);
+      if (k->bounded)
+        for (int i = 0; i < nx; i++) before[i] = r[nw + i] + k->z[slot * nx + i];
+      else
+        for (int i = 0; i < nx; i++) before[i] = r[nw + i];
+    }
+  }
+  for (int i = 0; i < np; i++) {
+    const size_t at = k->fp + (size_t)i;
+    if (k->bounded && k->active[at]) k->z[at] = -rp[i];
+    else if (fabs(rp[i]) > residual) residual = fabs(rp[i]);
+    if (fabs(gp[i]) > largest) largest = fabs(gp[i]);
+    if (fabs(Hp[i]) > product) product = fabs(Hp[i]);
+  }
+  if (force > largest) largest = force;
+  k->decrease = -(slope + curvature / 2);
+  k->optimality = product / (largest > 1e-300 ? largest : 1e-300);
+  if (product > largest) largest = product;
+  k->stationarity = residual / (largest > 1e-300 ? largest : 1e-300);
+}
+
+static void adjoint(core *k, const model *m) {
+  if (k->np) adjoint_sized(k, m, NX(k->s), NW(k->s), NP(k->s));
+  else adjoint_sized(k, m, NX(k->s), NW(k->s), 0);
+}
+
+#endif
