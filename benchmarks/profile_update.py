@@ -169,7 +169,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--updates", type=int, default=50)
     parser.add_argument("--compile", choices=["auto", "off"], default="auto", help="where the library can compile")
     options = parser.parse_args(arguments)
-    chosen = {"compile": options.compile} if accepts("compile") else {}
+    chosen = {"compile": options.compile}
     for name in options.problems:
         profile(every[name](options.updates), options.updates, chosen)
 

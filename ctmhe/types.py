@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -269,6 +269,19 @@ class Trajectory:
     p: Array
 
 
+class SolvedWindow(Protocol):
+    """What an estimate keeps of its window."""
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The solution."""
+        ...
+
+    def part(self, name: str) -> Array:
+        """Return one array of the solution or the problem, such as the prior."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """The result of one solve, at time `t`.
@@ -285,12 +298,8 @@ class Estimate:
         Disturbance estimate on the last cell.
     y : array (ny,)
         Estimated output at `t`.
-    trajectory : Trajectory
-        The whole window.
     cost : float
         Value of the cost at the solution.
-    prior : array (nx + np,)
-        The prior estimate at the window's left edge.
     status : Status
     seconds : float
         Wall-clock time of the call.
@@ -301,12 +310,21 @@ class Estimate:
     p: Array
     w: Array
     y: Array
-    trajectory: Trajectory
     cost: float
-    prior: Array
     status: Status
+    _solved: SolvedWindow = field(repr=False)
     seconds: float = field(compare=False, default=float("nan"))
     _covariance: Callable[[], tuple[Array, int]] | None = field(default=None, repr=False)
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """The whole window."""
+        return self._solved.trajectory
+
+    @property
+    def prior(self) -> Array:
+        """The prior estimate (nx + np,) at the window's left edge."""
+        return self._solved.part("prior")
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle the numbers; the covariance, which would need the window's functions, stays behind."""

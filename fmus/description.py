@@ -77,15 +77,11 @@ def _units(parent: ET.Element, scalars: list[_Scalar]) -> None:
     for name in sorted({s.variable.unit for s in scalars}):
         unit = ET.SubElement(definitions, "Unit", name=name)
         exponents = {"s": 1.0} if name == "s" else UNITS[name]
-        ET.SubElement(
-            unit, "BaseUnit", {k: repr(v) if k == "factor" else f"{v:g}" for k, v in exponents.items()}
-        )
+        ET.SubElement(unit, "BaseUnit", {k: repr(v) if k == "factor" else f"{v:g}" for k, v in exponents.items()})
 
 
 def _experiment(parent: ET.Element, model: Description) -> None:
-    ET.SubElement(
-        parent, "DefaultExperiment", startTime="0.0", stopTime=repr(model.stop), stepSize=repr(model.step)
-    )
+    ET.SubElement(parent, "DefaultExperiment", startTime="0.0", stopTime=repr(model.stop), stepSize=repr(model.step))
 
 
 _CAUSALITY = {
@@ -120,9 +116,7 @@ def _value(scalar: _Scalar) -> dict[str, str]:
     return value | ({} if variable.start is None else {"start": repr(variable.start)})
 
 
-def _dependencies(
-    scalars: list[_Scalar], scalar: _Scalar, knowns: tuple[str, ...], index: int
-) -> dict[str, str]:
+def _dependencies(scalars: list[_Scalar], scalar: _Scalar, knowns: tuple[str, ...], index: int) -> dict[str, str]:
     """Dependencies on the kinds `knowns`: as references (FMI 3, index 0) or indices from 1 (FMI 2, index 1).
 
     FMI 3 counts tunable parameters as known in every mode, FMI 2 in initialization mode only. CasADi takes
@@ -233,8 +227,6 @@ def _fmi3(model: Description, token: str) -> ET.Element:
     for tag, kind in _STRUCTURE_3:
         for scalar in scalars:
             if scalar.kind == kind:
-                known = {"valueReference": str(scalar.reference)} | _dependencies(
-                    scalars, scalar, ("x", "u", "p"), 0
-                )
+                known = {"valueReference": str(scalar.reference)} | _dependencies(scalars, scalar, ("x", "u", "p"), 0)
                 ET.SubElement(structure, tag, known)
     return root

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -10,6 +12,8 @@ from ctmhe.estimators import MHE
 from ctmhe.models import ContinuousModel
 from ctmhe.transcription import RK4
 from ctmhe.types import DiscountedCost, Measurement
+
+os.environ.setdefault("CTMHE_COMPILE", "off")  # hundreds of small models: those that need the compiler ask for it
 
 P_REACTOR = np.array([[4.009, 3.768], [3.768, 3.549]])  # thesis 3.4.1, continuous time
 REACTOR_COST = DiscountedCost(eta=0.4, P=2 * P_REACTOR, Q=2 * np.diag([1e3, 1e3, 1e2]), R=1e2)

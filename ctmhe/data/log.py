@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from ctmhe.errors import InputError
 from ctmhe.types import Array, frozen
 
+SMALLEST = 64  # rows for which a log has room at least
+
 
 class _Shared:
     """Storage that several versions of a log share: appending at its very end copies nothing."""
 
-    __slots__ = ("lock", "rows", "times")
+    __slots__ = ("addresses", "count", "lock", "rows", "times")
 
-    def __init__(self, times: list[float], rows: list[Array]):
-        self.times, self.rows, self.lock = times, rows, Lock()
+    def __init__(self, times: Array, rows: Array, capacity: int):
+        """Copy times (n,) and rows (n, width) to where `capacity` of them have room."""
+        self.times, self.rows, self.count = np.empty(capacity), np.empty((capacity, rows.shape[1])), len(times)
+        self.times[: self.count], self.rows[: self.count] = times, rows
+        self.addresses = (self.times.ctypes.data, self.rows.ctypes.data)
+        self.lock = Lock()
 
 
 class Log:
@@ -29,19 +34,27 @@ class Log:
 
     Appending at the end is O(1) amortised and shares storage between versions; a late row copies what is left of the
     window. Old versions stay valid: this is what lets the estimator's state be explicit.
+
+    Attributes
+    ----------
+    width : int
+    last_time : float
+        Time of the newest row, -inf when empty.
     """
 
-    __slots__ = ("_shared", "_start", "_stop", "width")
+    __slots__ = ("_shared", "_start", "_stop", "last_time", "width")
 
     def __init__(self, width: int, _shared: _Shared | None = None, _start: int = 0, _stop: int = 0):
         self.width = width
-        self._shared = _shared or _Shared([], [])
+        self._shared = _Shared(np.empty(0), np.empty((0, width)), SMALLEST) if _shared is None else _shared
         self._start, self._stop = _start, _stop
+        self.last_time = self._shared.times.item(_stop - 1) if _stop > _start else -np.inf
 
     @classmethod
     def of(cls, times: Sequence[float] | Array, rows: Array, width: int) -> Log:
         """Build from ordered times (n,) and rows (n, width)."""
-        return cls(width, _Shared([float(t) for t in times], [frozen(row) for row in rows]), 0, len(times))
+        count = len(times)
+        return cls(width, _Shared(np.asarray(times), np.reshape(rows, (count, width)), max(SMALLEST, count)), 0, count)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Log.of, (*self.arrays(), self.width)
@@ -50,49 +63,98 @@ class Log:
         return self._stop - self._start
 
     @property
-    def last_time(self) -> float:
-        """Time of the newest row, -inf when empty."""
-        return self._shared.times[self._stop - 1] if len(self) else -np.inf
+    def memory(self) -> tuple[int, int, int]:
+        """Addresses of the first time and of the first row, and the number of rows: what compiled code reads."""
+        times, rows = self._shared.addresses
+        return times + 8 * self._start, rows + 8 * self.width * self._start, self._stop - self._start
+
+    @property
+    def capacity(self) -> int:
+        """Rows that the storage behind this log has room for."""
+        return len(self._shared.times)
 
     def find(self, t: float) -> Array | None:
-        """Return the row at exactly `t`, or None."""
-        i = bisect_left(self._shared.times, t, self._start, self._stop)
-        return self._shared.rows[i] if i < self._stop and self._shared.times[i] == t else None
+        """Return the row at exactly `t` (a copy), or None."""
+        if t > self.last_time:
+            return None
+        i = self._position(t)
+        return self._shared.rows[i].copy() if i < self._stop and self._shared.times[i] == t else None
+
+    def count_until(self, until: float, *, beyond: int = 0) -> int:
+        """Return the number of rows up to and including `until`, and `beyond` rows after it, as far as there are."""
+        if until >= self.last_time:
+            return self._stop - self._start
+        return min(self._position(until, "right") + beyond, self._stop) - self._start
+
+    def first_from(self, t: float) -> tuple[float, Array] | None:
+        """Return time and row (a copy) of the first row at or after `t`, or None."""
+        i = self._position(t)
+        return (self._shared.times.item(i), self._shared.rows[i].copy()) if i < self._stop else None
 
     def put(self, t: float, row: Array) -> Log:
         """Return a log that also holds `row` at `t`, in place of a row at exactly the same time."""
-        shared = self._shared
-        if not len(self) or t > shared.times[self._stop - 1]:
-            with shared.lock:
-                if self._stop == len(shared.times):
-                    shared.times.append(t)
-                    shared.rows.append(row)
-                    return Log(self.width, shared, self._start, self._stop + 1)
-        times, rows = shared.times[self._start : self._stop], shared.rows[self._start : self._stop]
-        i = bisect_left(times, t)
-        if i < len(times) and times[i] == t:
-            rows[i] = row
-        else:
-            times.insert(i, t)
-            rows.insert(i, row)
-        return Log(self.width, _Shared(times, rows), 0, len(times))
+        if t > self.last_time:
+            return self._append(t, row, 1)
+        i = self._position(t)
+        behind = i + 1 if i < self._stop and self._shared.times[i] == t else i
+        times, rows = self._shared.times, self._shared.rows
+        parts = (slice(self._start, i), slice(behind, self._stop))
+        return Log.of(
+            np.concatenate([times[parts[0]], [t], times[parts[1]]]),
+            np.concatenate([rows[parts[0]], np.reshape(row, (1, -1)), rows[parts[1]]]),
+            self.width,
+        )
+
+    def extend(self, times: Array, rows: Array) -> Log:
+        """Return a log with ordered rows (n, width) appended, none of them before the last one."""
+        return self._append(times, rows, len(times)) if len(times) else self
+
+    def _append(self, times: Any, rows: Array, count: int) -> Log:
+        shared, start, stop = self._shared, self._start, self._stop
+        with shared.lock:
+            fits = stop == shared.count and stop + count <= len(shared.times)
+            if fits:
+                shared.count = stop + count
+        if not fits:  # another version wrote behind this one, or there is no room: go on in storage of our own
+            live = slice(start, stop)
+            capacity = max(SMALLEST, 2 * (stop - start + count))
+            shared = _Shared(shared.times[live], shared.rows[live], capacity)
+            start, stop = 0, shared.count
+            shared.count += count
+        shared.times[stop : stop + count] = times
+        shared.rows[stop : stop + count] = rows
+        return Log(self.width, shared, start, stop + count)
+
+    def _position(self, t: float, side: Literal["left", "right"] = "left") -> int:
+        return self._start + int(self._shared.times[self._start : self._stop].searchsorted(t, side))
 
     def drop_before(self, t: float, *, keep_holding: bool = False) -> Log:
         """Return the log without rows older than `t`; `keep_holding` keeps the last of them, which still holds."""
-        start = bisect_left(self._shared.times, t, self._start, self._stop)
+        start = self._position(t)
         if keep_holding and start > self._start and (start == self._stop or self._shared.times[start] > t):
             start -= 1
-        if start > max(64, 2 * (self._stop - start)):
-            shared = _Shared(self._shared.times[start : self._stop], self._shared.rows[start : self._stop])
-            return Log(self.width, shared, 0, len(shared.times))
-        return Log(self.width, self._shared, start, self._stop)
+        return self._from(start)
+
+    def drop_first(self, count: int) -> Log:
+        """Return the log without its first `count` rows."""
+        return self._from(self._start + count)
+
+    def _from(self, start: int) -> Log:
+        live = self._stop - start
+        if start > self._start and self.capacity > max(SMALLEST, 8 * live):  # do not keep what is long gone
+            times, rows = self._shared.times[start : self._stop], self._shared.rows[start : self._stop]
+            return Log(self.width, _Shared(times, rows, max(SMALLEST, 2 * live)), 0, live)
+        return Log(self.width, self._shared, start, self._stop) if start > self._start else self
+
+    def drop_after(self, t: float) -> Log:
+        """Return the log without rows newer than `t`."""
+        stop = self._position(t, "right")
+        return Log(self.width, self._shared, self._start, stop) if stop < self._stop else self
 
     def arrays(self, until: float = np.inf, *, beyond: int = 0) -> tuple[Array, Array]:
         """Return times (n,) and rows (n, width) up to and including `until`, and `beyond` rows after it."""
-        stop = min(bisect_right(self._shared.times, until, self._start, self._stop) + beyond, self._stop)
-        times = np.array(self._shared.times[self._start : stop])
-        rows = self._shared.rows[self._start : stop]
-        return times, np.array(rows) if rows else np.empty((0, self.width))
+        stop = self._start + self.count_until(until, beyond=beyond)
+        return self._shared.times[self._start : stop].copy(), self._shared.rows[self._start : stop].copy()
 
 
 @dataclass(frozen=True, eq=False)

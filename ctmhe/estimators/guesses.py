@@ -17,7 +17,7 @@ from ctmhe.types import Array
 def starting_points(stage: StageFunction, state: State, window: Window) -> list[tuple[str, Callable[[], Guess]]]:
     """Return the names of the guesses and how to make them, best first."""
     points: list[tuple[str, Callable[[], Guess]]] = [("shifted guess", lambda: shifted_guess(stage, window))]
-    if state.window is not None and state.window.t[-1] >= window.mesh.t[0]:
+    if state.window is not None and state.t >= window.mesh.t[0]:
         points.insert(0, ("warm start", lambda: warm_start(stage, state, window)))
     return points
 
@@ -37,9 +37,8 @@ def shifted_guess(stage: StageFunction, window: Window) -> Guess:
 
 def warm_start(stage: StageFunction, state: State, window: Window) -> Guess:
     """Return the last solution on the new mesh, carried forward behind its end, with its active set."""
-    last, mesh = state.window, window.mesh
-    assert last is not None
-    n = len(mesh)
+    assert state.window is not None
+    last, mesh, n = state.window.trajectory, window.mesh, len(window.mesh)
     old = int(np.searchsorted(mesh.t, last.t[-1], side="right"))  # nodes that the last window covers
     x = np.empty((n + 1, stage.nx))
     for i in range(stage.nx):
@@ -57,7 +56,7 @@ def warm_start(stage: StageFunction, state: State, window: Window) -> Guess:
         return shifted_guess(stage, window)
     node = np.clip(np.searchsorted(last.t, mesh.t - mesh.tolerance), 0, len(last.x) - 1)
     covered = (mesh.t <= last.t[-1] + mesh.tolerance)[:, None]
-    x_active, w_active, y_active, p_active = state.active
+    x_active, w_active, y_active, p_active = (state.window.part(f"{key}_active") for key in "xwyp")
     return Guess(
         x,
         w,
@@ -82,9 +81,10 @@ def open_loop(stage: StageFunction, state: State, window: Window) -> Solution:
     x, w = np.tile(state.x, (n + 1, 1)), np.zeros((n, stage.nw))
     passed = int(np.searchsorted(mesh.t, state.t, side="right"))  # nodes up to the last estimate
     if state.window is not None:
+        last = state.window.trajectory
         for k in range(passed):
-            if mesh.t[k] >= state.window.t[0]:
-                x[k] = trajectory_at(stage, state.window, mesh.t[k])
+            if mesh.t[k] >= last.t[0]:
+                x[k] = trajectory_at(stage, last, mesh.t[k])
     try:
         if 0 < passed <= n:  # from the last estimate, which may lie inside a slot, to the next node
             k = passed - 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,19 +14,21 @@ from ctmhe.data.log import Log
 from ctmhe.data.window import held_inputs
 from ctmhe.errors import InputError, NotEstimated, TooLate
 from ctmhe.estimators.guesses import open_loop, starting_points
-from ctmhe.estimators.priors import Piece, filtering_prior, trajectory_at
-from ctmhe.estimators.state import State, frozen_set, load_state, save_state
+from ctmhe.estimators.priors import empty_path, filtering_prior, path_rows, trajectory_at
+from ctmhe.estimators.state import State, load_state, save_state
 from ctmhe.models.continuous import Model
 from ctmhe.models.signals import Signals
 from ctmhe.solvers.base import Solution, Solver
-from ctmhe.solvers.compiled import compiled_solver
+from ctmhe.solvers.compiled import CompiledGaussNewton, compiled_solver
 from ctmhe.solvers.gauss_newton import GaussNewton
 from ctmhe.solvers.ipopt import Ipopt
 from ctmhe.solvers.ladder import climb
+from ctmhe.solvers.updates import CompiledUpdates
 from ctmhe.transcription.assembly import Assembly, Records, hold_kinds
 from ctmhe.transcription.grid import Mesh, same_time
 from ctmhe.transcription.integrators import Integrator, StepMap
 from ctmhe.transcription.problem import Window
+from ctmhe.transcription.solved import Layout, Solved
 from ctmhe.transcription.stage import StageFunction
 from ctmhe.types import (
     Array,
@@ -36,13 +39,12 @@ from ctmhe.types import (
     Measurement,
     Outcome,
     Status,
-    Trajectory,
     finite_time,
     frozen,
     positive,
 )
 
-SOLVERS = ("gauss-newton", "ipopt")
+SOLVERS = ("gauss-newton", "numpy", "ipopt")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +97,13 @@ class MHE:
         `DiscreteModel` only: count the measurement at the estimate's own time.
     longest_wait : float, optional
         The longest wait between estimates, if declared; must be shorter than the horizon (3.19).
-    solver : {"gauss-newton", "ipopt"}
-    compile : {"off", "auto"}
-        `auto` runs Gauss-Newton in the compiled core, together with the model's functions where a C compiler is found
-        (once per model, cached on disk) and these can be generated, else with CasADi's virtual machine; `off` (the
-        default while the core is young) runs it in NumPy.
+    solver : {"gauss-newton", "numpy", "ipopt"}
+        `gauss-newton` runs in the compiled core; `numpy` is the same method in Python, which also takes over where
+        there is no core; `ipopt` is the reference.
+    compile : {"auto", "off"}, optional
+        `auto` compiles the model's functions together with the core, where a C compiler is found and they can be
+        generated: once per model, in seconds, cached on disk. `off` evaluates them in CasADi's virtual machine. When
+        left out, `$CTMHE_COMPILE`, else `auto`.
     max_iterations : int
     clock : callable, optional
         Seconds, for `Estimate.seconds`.
@@ -126,7 +130,7 @@ class MHE:
         filtering: bool = False,
         longest_wait: float | None = None,
         solver: str = "gauss-newton",
-        compile: str = "off",
+        compile: str | None = None,
         max_iterations: int = 50,
         clock: Callable[[], float] = time.perf_counter,
     ):
@@ -181,11 +185,18 @@ class MHE:
         )
         self._gauss_newton = GaussNewton(self.stage, max_iterations=max_iterations)
         self._reference = Ipopt(self.stage)
+        compile = compile or os.environ.get("CTMHE_COMPILE") or "auto"
         if compile not in ("off", "auto"):
             raise InputError(f"compile must be 'off' or 'auto', got {compile!r}")
-        self._solver: Solver = self._gauss_newton if solver == "gauss-newton" else self._reference
-        if solver == "gauss-newton" and compile == "auto":
-            self._solver = compiled_solver(self.stage, max_iterations=max_iterations) or self._gauss_newton
+        self._solver: Solver = self._reference if solver == "ipopt" else self._gauss_newton
+        if solver == "gauss-newton":
+            compiled = compiled_solver(self.stage, specialise=compile == "auto", max_iterations=max_iterations)
+            self._solver = compiled or self._gauss_newton
+        self._layout = Layout.of(self.stage)
+        self._updates = None
+        if isinstance(self._solver, CompiledGaussNewton) and CompiledUpdates.covers(self.assembly):
+            self._updates = CompiledUpdates(self._solver, self.assembly, self._layout)
+        self._holds = bool(self.assembly.held.any())
         self._silent = np.zeros(len(model.w))
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -225,7 +236,8 @@ class MHE:
         u_start = getattr(model, "u_start", None)
         if len(model.u) and u_start is not None:
             inputs = inputs.put(t, frozen(u_start))
-        return State(t, t, frozen(np.concatenate([x0, p0])), x0, p0, Log(len(model.y)), inputs)
+        start = frozen(np.concatenate([x0, p0]))
+        return State(t, t, start, x0, p0, Log(len(model.y)), inputs, empty_path(self.stage), t)
 
     @staticmethod
     def _named(signals: Signals, values: Any, default: Array) -> Any:
@@ -318,27 +330,43 @@ class MHE:
         began = self.clock()
         state = _checked(state, self)
         t = finite_time(t, "estimate")
-        if t < state.t - self._slack(t):
-            raise NotEstimated(
-                f"estimate at t = {t:g} s lies before the last one at {state.t:g} s; "
-                "smooth(state, t) gives estimates of the past"
-            )
-        t = max(t, state.t)
+        if t < state.t:
+            if t < state.t - self._slack(t):
+                raise NotEstimated(
+                    f"estimate at t = {t:g} s lies before the last one at {state.t:g} s; "
+                    "smooth(state, t) gives estimates of the past"
+                )
+            t = state.t
         start = t - self.horizon
         growing = start <= state.t0 + self._slack(t)
         start = state.t0 if growing else start
-        prior, factor, notes = self._prior(state, start, growing)
-        records = self._records(state, t, start)
-        window = self.assembly.window(start, t, records, prior, growing=growing, prior_factor=factor)
-        if not window.L_y.any():
-            notes = (*notes, "no measurement in window")
+        again = t == state.t  # the solve at this instant, repeated with what has arrived since
+        since = state.since if again else state.t
+        if self._updates is not None:
+            logs = (state.measurements, state.inputs, state.path)
+            known, times = (state.start, state.p), (state.t, since)
+            update = self._updates.run((start, t), growing, *logs, state.window, known, times)
+            if update is not None:
+                notes = () if update.measured else ("no measurement in window",)
+                reached = (update.iterations, update.optimality, update.feasibility)
+                status = Status(Outcome.SOLVED, True, *reached, notes=notes)
+                added = (update.path_times, update.path_rows)
+                return self._conclude(state, t, since, update.solved, added, update.cost, status, began)
+        window, notes = self._window(state, start, t, growing)
         guesses = starting_points(self.stage, state, window)
         solution, status = climb(window, self._solver, lambda: self._reference, guesses, notes)
         if solution is None:
             solution = open_loop(self.stage, state, window)
-        trajectory = _trajectory(window, solution)
-        estimate = self._to_estimate(window, solution, trajectory, status, began)
-        return self._advance(state, estimate, solution), estimate
+        solved = self._packed(window, solution)
+        added = path_rows(solved.trajectory, since)
+        return self._conclude(state, t, since, solved, added, solution.cost, status, began)
+
+    def _window(self, state: State, start: float, end: float, growing: bool) -> tuple[Window, tuple[str, ...]]:
+        """Return the problem over [start, end], and what there is to note about it."""
+        prior, factor, notes = self._prior(state, start, growing)
+        records = self._records(state, end, start)
+        window = self.assembly.window(start, end, records, prior, growing=growing, prior_factor=factor)
+        return window, notes if window.L_y.any() else (*notes, "no measurement in window")
 
     def _prior(self, state: State, start: float, growing: bool) -> tuple[Array, float, tuple[str, ...]]:
         """Return the prior (3.18), the factor on its weight, and notes.
@@ -350,7 +378,7 @@ class MHE:
             return state.start, 1.0, ()
         slack = self._slack(state.t)
         if start <= state.t + slack:
-            prior = filtering_prior(self.stage, state.pieces, min(start, state.t), slack)
+            prior = filtering_prior(self.stage, state.path, min(start, state.t), slack)
             if prior is not None:
                 return prior, 1.0, ()
         gap = max(start - state.t, 0.0)
@@ -372,58 +400,61 @@ class MHE:
             )
         return times, rows
 
-    def _to_estimate(
-        self, window: Window, solution: Solution, trajectory: Trajectory, status: Status, began: float
-    ) -> Estimate:
+    def _packed(self, window: Window, solution: Solution) -> Solved:
+        """Return a solver's result as the blocks that the core would have written."""
+        point = solution.point
+        arrays = vars(point) | {
+            "t": window.mesh.t, "y": solution.y, "u0": window.u0, "u1": window.u1, "prior": window.prior,
+        }  # fmt: skip
+        if solution.multipliers is not None:
+            arrays |= {f"{name}_multiplier": array for name, array in vars(solution.multipliers).items()}
+        return Solved.of(self._layout, arrays)
+
+    def _conclude(
+        self,
+        state: State,
+        t: float,
+        since: float,
+        solved: Solved,
+        added: tuple[Array, Array],
+        cost: float,
+        status: Status,
+        began: float,
+    ) -> tuple[State, Estimate]:
+        """Return the next state and the estimate of a solved window; `added` is what it adds to the path."""
+        x, p, w, y = solved.last()
+        if self.model.step is not None:
+            u = solved.part("u1")[-1]
+            idle = solved.part("t")[-1] == solved.part("t")[-2]
+            y = frozen(np.asarray(self.model.output(t, x, u, w if idle else self._silent, p)).reshape(-1))
+        edge = t - self.horizon
+        slack = 1e-6 * self.interval
+        path = state.path if t > state.t else state.path.drop_after(since)
+        held = self.hold_limit if self._holds else 0.0
+        inputs = state.inputs
+        new = State(
+            state.t0,
+            t,
+            state.start,
+            x,
+            p,
+            state.measurements.drop_before(edge - held - slack),
+            inputs.drop_before(edge - slack, keep_holding=True) if len(inputs) else inputs,
+            path.extend(*added).drop_before(edge - slack),
+            since,
+            solved,
+            state.solves + 1,
+        )
+
         def covariance() -> tuple[Array, int]:
-            values, rank = self._gauss_newton.covariance(window, solution.point)
+            start = max(edge, state.t0)
+            window, _ = self._window(state, start, t, growing=edge <= state.t0 + self._slack(t))
+            values, rank = self._gauss_newton.covariance(window, solved.guess)
             return frozen(values), rank
 
-        y = trajectory.y[-1]
-        if self.model.step is not None:
-            u = window.u1[-1] if len(self.model.u) else np.empty(0)
-            w = solution.point.w[-1] if window.mesh.h[-1] == 0 else self._silent
-            y = frozen(
-                np.asarray(self.model.output(window.mesh.t[-1], trajectory.x[-1], u, w, trajectory.p)).reshape(-1)
-            )
-        return Estimate(
-            t=float(window.mesh.t[-1]),
-            x=frozen(trajectory.x[-1]),
-            p=frozen(trajectory.p),
-            w=frozen(trajectory.w[-1]),
-            y=frozen(y),
-            trajectory=trajectory,
-            cost=solution.cost,
-            prior=frozen(window.prior),
-            status=status,
-            seconds=self.clock() - began,
-            _covariance=None if status.outcome is Outcome.PREDICTED else covariance,
-        )
-
-    def _advance(self, state: State, estimate: Estimate, solution: Solution) -> State:
-        t, horizon = estimate.t, self.horizon
-        pieces = state.pieces
-        if t > state.t or not pieces:
-            pieces = (*pieces, Piece.of(estimate.trajectory, state.t))
-        else:  # the solve at this instant, repeated with what has arrived since
-            pieces = (*pieces[:-1], Piece.of(estimate.trajectory, pieces[-1].start))
-        while len(pieces) > 1 and pieces[0].end < t - horizon:
-            pieces = pieces[1:]
-        edge = t - horizon
-        keep = edge - (self.hold_limit if self.assembly.held.any() else 0.0) - 1e-6 * self.interval
-        point = solution.point
-        return replace(
-            state,
-            t=t,
-            x=estimate.x,
-            p=estimate.p,
-            measurements=state.measurements.drop_before(keep),
-            inputs=state.inputs.drop_before(edge - 1e-6 * self.interval, keep_holding=True),
-            pieces=pieces,
-            window=estimate.trajectory,
-            active=tuple(map(frozen_set, (point.x_active, point.w_active, point.y_active, point.p_active))),
-            solves=state.solves + 1,
-        )
+        seconds = self.clock() - began
+        known = None if status.outcome is Outcome.PREDICTED else covariance
+        return new, Estimate(t, x, p, w, y, cost, status, solved, seconds, known)
 
     def propagate(self, state: State, t0: float, t1: float, x: Array, p: Array) -> Array:
         """Return the state at `t1` from `x` (nx,) at `t0`, without disturbance, under the inputs that `state` knows.
@@ -482,10 +513,12 @@ class MHE:
             If `t` lies outside the last window.
         """
         t = finite_time(t, "smooth")
-        if state.window is None or not state.window.t[0] <= t <= state.window.t[-1]:
-            span = "no estimate yet" if state.window is None else f"[{state.window.t[0]:g}, {state.window.t[-1]:g}] s"
-            raise NotEstimated(f"smooth at t = {t:g} s: the last window covers {span}")
-        return frozen(trajectory_at(self.stage, state.window, t))
+        if state.window is None:
+            raise NotEstimated(f"smooth at t = {t:g} s: the last window covers no estimate yet")
+        last = state.window.trajectory
+        if not last.t[0] <= t <= last.t[-1]:
+            raise NotEstimated(f"smooth at t = {t:g} s: the last window covers [{last.t[0]:g}, {last.t[-1]:g}] s")
+        return frozen(trajectory_at(self.stage, last, t))
 
     def trajectory(self, state: State, t: float) -> Array:
         """Return x_hat(t) (nx,) of the estimated trajectory (3.16), left-continuous, within the last horizon.
@@ -496,9 +529,10 @@ class MHE:
             If `t` lies outside what the state keeps.
         """
         t = finite_time(t, "trajectory")
-        if t == state.t0 and (not state.pieces or state.pieces[0].start == state.t0):
+        first = state.path.first_from(-np.inf)
+        if t == state.t0 and (first is None or first[1][1] == state.t0):
             return frozen(state.start[: self.stage.nx])
-        value = filtering_prior(self.stage, state.pieces, t, self._slack(t))
+        value = filtering_prior(self.stage, state.path, t, self._slack(t))
         if value is None:
             raise NotEstimated(
                 f"trajectory at t = {t:g} s: kept is the horizon before the last estimate at {state.t:g} s"
@@ -519,7 +553,7 @@ class MHE:
 
         Cost, bounds and solver may differ: a saved state can be continued with other weights.
         """
-        return load_state(path, self._fingerprint())
+        return load_state(path, self._fingerprint(), self._layout)
 
     def _fingerprint(self) -> dict[str, Any]:
         return {
@@ -531,12 +565,6 @@ class MHE:
             "hold_limit": self.hold_limit,
             "input_hold": "linear" if self.assembly.input_linear else "zero",
         }
-
-
-def _trajectory(window: Window, solution: Solution) -> Trajectory:
-    point = solution.point
-    parts = (window.mesh.t, point.x, point.w, solution.y[:, -1], window.u0, window.u1, point.p)
-    return Trajectory(*(frozen(part) for part in parts))
 
 
 def _checked(state: Any, mhe: MHE) -> State:

@@ -1,38 +1,57 @@
-"""The estimated trajectory (3.16) and the priors read from it."""
+"""The estimated trajectory (3.16) and the priors read from it.
+
+It is kept as a `Log` of slots, the path. A row belongs to the time at which its slot ends and holds the slot's start,
+from when on the row counts (a later solve never rewrites what an earlier one said), x, w, u0, u1, p, and x at its end.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from ctmhe.data.log import Log
 from ctmhe.transcription.stage import StageFunction
 from ctmhe.types import Array, Trajectory
 
 
-@dataclass(frozen=True, eq=False)
-class Piece:
-    """One segment of the estimated trajectory: valid on (start, end], taken from one solve and never rewritten."""
+def empty_path(stage: StageFunction) -> Log:
+    """Return the path before the first estimate."""
+    return Log(2 + 2 * stage.nx + stage.nw + 2 * stage.nu + stage.np)
 
-    start: float
-    end: float
-    trajectory: Trajectory
 
-    @classmethod
-    def of(cls, trajectory: Trajectory, start: float) -> Piece:
-        """Cut the slots of a window's solution that reach beyond `start`."""
-        t = trajectory.t
-        first = int(np.clip(np.searchsorted(t, start, side="right") - 1, 0, len(t) - 2))
-        cut = Trajectory(
-            t[first:],
-            trajectory.x[first:],
-            trajectory.w[first:],
-            trajectory.y[first:],
-            trajectory.u0[first:],
-            trajectory.u1[first:],
-            trajectory.p,
-        )
-        return cls(start, float(t[-1]), cut)
+def path_rows(trajectory: Trajectory, since: float) -> tuple[Array, Array]:
+    """Return ends (m,) and rows (m, width) of the slots of a window's solution that reach beyond `since`."""
+    t, last = trajectory.t, len(trajectory.t) - 2
+    first = int(np.clip(np.searchsorted(t, since, side="right") - 1, 0, last))
+    slots = np.array([k for k in range(first, last + 1) if t[k + 1] > t[k]], dtype=int)
+    p = np.broadcast_to(trajectory.p, (len(slots), len(trajectory.p)))
+    start = t[slots]
+    parts = (start, np.maximum(start, since), trajectory.x[slots], trajectory.w[slots], trajectory.u0[slots],
+             trajectory.u1[slots], p, trajectory.x[slots + 1])  # fmt: skip
+    return t[slots + 1], np.column_stack(parts)
+
+
+def filtering_prior(stage: StageFunction, path: Log, t: float, tolerance: float) -> Array | None:
+    """Return (x_hat(t), p_hat(t)) of the estimated trajectory: the prior (3.18). None where it is not kept.
+
+    Where a solve ends and the next begins, the earlier one counts (3.17). Times closer than `tolerance` (seconds) to
+    that instant are that instant: round-off must not choose.
+    """
+    if t > path.last_time + tolerance:
+        return None
+    found = path.first_from(min(t - tolerance, path.last_time))
+    if found is None:
+        return None
+    end, row = found
+    sizes = (stage.nx, stage.nw, stage.nu, stage.nu, stage.np, stage.nx)
+    x, w, u0, u1, p, x_end = np.split(row[2:], np.cumsum(sizes)[:-1])
+    start, since = row[:2]
+    if t <= since + tolerance:
+        return None
+    if t >= end:
+        x = x_end
+    elif t > start:
+        x, _ = stage.step(start, t - start, x, w, p, u0, u0 + (u1 - u0) * ((t - start) / (end - start)))
+    return np.concatenate([x, p])
 
 
 def trajectory_at(stage: StageFunction, trajectory: Trajectory, t: float) -> Array:
@@ -52,29 +71,3 @@ def trajectory_at(stage: StageFunction, trajectory: Trajectory, t: float) -> Arr
     u = u0 + (trajectory.u1[k] - u0) * (passed / length)
     x, _ = stage.step(nodes[k], passed, trajectory.x[k], trajectory.w[k], trajectory.p, u0, u)
     return x
-
-
-def piece_at(pieces: tuple[Piece, ...], t: float, tolerance: float) -> Piece | None:
-    """Return the piece whose solve is the first at or after `t` (3.17), None when `t` lies outside what is kept.
-
-    Times closer than `tolerance` (seconds) to a solve instant are that instant: round-off must not choose the piece.
-    """
-    if not pieces or t > pieces[-1].end + tolerance or t <= pieces[0].start + tolerance:
-        return None
-    low, high = 0, len(pieces) - 1
-    while low < high:
-        middle = (low + high) // 2
-        if pieces[middle].end >= t - tolerance:
-            high = middle
-        else:
-            low = middle + 1
-    return pieces[low]
-
-
-def filtering_prior(stage: StageFunction, pieces: tuple[Piece, ...], t: float, tolerance: float) -> Array | None:
-    """Return (x_hat(t), p_hat(t)) of the estimated trajectory: the prior (3.18). None where it is not kept."""
-    piece = piece_at(pieces, t, tolerance)
-    if piece is None:
-        return None
-    t = min(t, piece.end)
-    return np.concatenate([trajectory_at(stage, piece.trajectory, t), piece.trajectory.p])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +11,14 @@ import numpy as np
 
 from ctmhe.data.log import Log
 from ctmhe.errors import InputError
-from ctmhe.estimators.priors import Piece
-from ctmhe.types import Array, Trajectory, frozen
+from ctmhe.transcription.solved import Layout, Solved
+from ctmhe.types import Array, frozen
 
-VERSION = 1
+VERSION = 2
+LOGS = ("measurements", "inputs", "path")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class State:
     """The estimator's memory at one moment.
 
@@ -33,12 +34,12 @@ class State:
         The last estimate.
     measurements, inputs : Log
         What is still needed, ordered in time.
-    pieces : tuple of Piece
-        The estimated trajectory (3.16) over the last horizon.
-    window : Trajectory or None
+    path : Log
+        The estimated trajectory (3.16) over the last horizon, as rows of `priors.path_rows`.
+    since : float
+        From when on the last estimate defines it.
+    window : Solved or None
         The last solution: warm start, and what `smooth` reads.
-    active : tuple of arrays
-        Bounds active there (x, w, y, p).
     solves : int
     """
 
@@ -49,38 +50,27 @@ class State:
     p: Array
     measurements: Log
     inputs: Log
-    pieces: tuple[Piece, ...] = ()
-    window: Trajectory | None = None
-    active: tuple[np.ndarray, ...] = ()
+    path: Log
+    since: float
+    window: Solved | None = None
     solves: int = 0
-
-
-def frozen_set(active: Any) -> np.ndarray:
-    """Return a read-only copy of one part of an active set."""
-    array = np.array(active, dtype=np.int8)
-    array.flags.writeable = False
-    return array
 
 
 def save_state(state: State, path: str | Path, fingerprint: dict[str, Any]) -> None:
     """Write a state to a versioned `.npz` file (no pickle inside), in one atomic step."""
     arrays: dict[str, Array] = {"start": state.start, "x": state.x, "p": state.p}
-    for name in ("measurements", "inputs"):
+    for name in LOGS:
         arrays[f"{name}_t"], arrays[f"{name}_rows"] = getattr(state, name).arrays()
-    trajectories = {f"piece{i}": piece.trajectory for i, piece in enumerate(state.pieces)}
     if state.window is not None:
-        trajectories["window"] = state.window
-        arrays |= {f"active{i}": part for i, part in enumerate(state.active)}
-    for name, trajectory in trajectories.items():
-        arrays |= {f"{name}_{field.name}": getattr(trajectory, field.name) for field in fields(Trajectory)}
+        arrays |= {"window_values": state.window.values, "window_active": state.window.active}
     header = {
         "version": VERSION,
         "fingerprint": fingerprint,
         "t0": state.t0,
         "t": state.t,
+        "since": state.since,
         "solves": state.solves,
-        "pieces": [[piece.start, piece.end] for piece in state.pieces],
-        "window": state.window is not None,
+        "slots": None if state.window is None else state.window.n,
     }
     path = Path(path)
     temporary = path.with_name(path.name + ".part")
@@ -92,7 +82,7 @@ def save_state(state: State, path: str | Path, fingerprint: dict[str, Any]) -> N
         raise InputError(f"state: cannot write {str(path)!r}: {error}") from error
 
 
-def load_state(path: str | Path, fingerprint: dict[str, Any]) -> State:
+def load_state(path: str | Path, fingerprint: dict[str, Any], layout: Layout) -> State:
     """Read a state; raise `InputError` when the file is damaged or was written by another configuration."""
     try:
         with np.load(path, allow_pickle=False) as data:
@@ -110,24 +100,18 @@ def load_state(path: str | Path, fingerprint: dict[str, Any]) -> State:
                 f"state: {str(path)!r} was saved by an estimator with {key} = {header['fingerprint'].get(key)}, "
                 f"this one has {value}"
             )
-
-    def trajectory(name: str) -> Trajectory:
-        return Trajectory(*(frozen(arrays[f"{name}_{field.name}"]) for field in fields(Trajectory)))
-
-    def log(name: str) -> Log:
-        return Log.of(arrays[f"{name}_t"], arrays[f"{name}_rows"], arrays[f"{name}_rows"].shape[1])
-
-    window = trajectory("window") if header["window"] else None
+    window = None
+    if header["slots"] is not None:
+        window = Solved.closed(layout, header["slots"], arrays["window_values"], arrays["window_active"])
+    logs = {name: Log.of(arrays[f"{name}_t"], rows := arrays[f"{name}_rows"], rows.shape[1]) for name in LOGS}
     return State(
         t0=header["t0"],
         t=header["t"],
         start=frozen(arrays["start"]),
         x=frozen(arrays["x"]),
         p=frozen(arrays["p"]),
-        measurements=log("measurements"),
-        inputs=log("inputs"),
-        pieces=tuple(Piece(a, b, trajectory(f"piece{i}")) for i, (a, b) in enumerate(header["pieces"])),
+        since=header["since"],
         window=window,
-        active=tuple(frozen_set(arrays[f"active{i}"]) for i in range(4)) if window is not None else (),
         solves=header["solves"],
+        **logs,
     )

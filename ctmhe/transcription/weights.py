@@ -103,6 +103,11 @@ class WeightFunction:
             self.root(0.0)
 
     @property
+    def constant(self) -> bool:
+        """Whether the weight is the same at all times."""
+        return self._constant is not None
+
+    @property
     def is_zero(self) -> bool:
         """Whether this weight is identically zero."""
         return self._constant is not None and not self._constant.any()

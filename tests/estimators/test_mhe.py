@@ -139,7 +139,7 @@ def run_long(count):
         state = mhe.observe(state, Measurement(k * 0.01, [np.sin(k * 0.01)]))
         if k % 50 == 49:
             state, _ = mhe.estimate(state, k * 0.01)
-            sizes.append(len(state.measurements._shared.times) + len(state.pieces) + len(state.inputs))
+            sizes.append(state.measurements.capacity + state.path.capacity + len(state.inputs))
     return sizes
 
 

@@ -179,7 +179,7 @@ def test_states_and_estimates_copy_and_pickle(tmp_path):
     for other in (copy.deepcopy(state), pickle.loads(pickle.dumps(state))):
         same(mhe.estimate(state, 1.5)[1], mhe.estimate(other, 1.5)[1])
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(estimate)).x, estimate.x)
-    for array in (*state.active, state.x, state.start, estimate.trajectory.x):
+    for array in (state.window.active, state.window.values, state.x, state.start, estimate.trajectory.x):
         with pytest.raises(ValueError, match="read-only"):
             array[...] = 0
 

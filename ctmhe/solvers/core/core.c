@@ -15,6 +15,7 @@
  */
 #include "model.h"
 #include "program.h"
+#include "update.h"
 
 size_t ctmhe_scratch_size(const ctmhe_stage *stage, int n) {
   core k;
@@ -450,5 +451,28 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
   result->iterations = iteration;
   hand_over(k, current, result, stepped);
   result->stop = stop;
+  return stop;
+}
+
+/* ---- Updates ------------------------------------------------------------------------------------------------ */
+
+size_t ctmhe_update_size(const ctmhe_stage *stage, int capacity) {
+  assembly a;
+  return lay_out_assembly(&a, NULL, stage, capacity);
+}
+
+int ctmhe_assemble(const ctmhe_stage *stage, const ctmhe_estimator *estimator, ctmhe_request *request,
+                   ctmhe_window *window, ctmhe_result *result, void *scratch) {
+  assembly a;
+  return assemble(&a, stage, estimator, request, window, result, scratch);
+}
+
+int ctmhe_update(const ctmhe_stage *stage, const ctmhe_estimator *estimator, ctmhe_request *request,
+                 const ctmhe_options *options, ctmhe_window *window, ctmhe_result *result, void *scratch) {
+  assembly a;
+  const int outcome = assemble(&a, stage, estimator, request, window, result, scratch);
+  if (outcome) return outcome;
+  const int stop = ctmhe_solve(stage, window, options, result, a.solve);
+  if (stop == CTMHE_CONVERGED) write_path(&a, window, result, request);
   return stop;
 }

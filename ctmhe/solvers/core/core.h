@@ -91,6 +91,54 @@ typedef struct {              /* in and out */
   int stop, iterations, factorizations; /* out */
 } ctmhe_result;
 
+typedef struct {              /* an estimator: what does not change from update to update */
+  double interval;            /* cell on which w is constant, seconds; the step of a discrete model */
+  double hold_limit, rate, prior_rate; /* seconds; discounts per second */
+  int parts;                  /* integration steps a cell */
+  int discrete, filtering, end_slot, input_linear, p_estimated;
+  int diagonal_R, diagonal_point; /* the roots below are diagonal; root_S always is */
+  const uint8_t *held, *linear; /* (ny) how each sensor's samples enter */
+  const double *nodes, *shares; /* (q - 1) quadrature of a slot */
+  const double *root_P, *root_Q, *root_R, *root_point, *root_S; /* square roots of the weights; root_S may be NULL */
+  const double *x_lower, *x_upper, *w_lower, *w_upper, *y_lower, *y_upper, *residual_lower, *residual_upper;
+  const double *p_lower, *p_upper, *x_scale, *w_scale, *p_scale, *y_scale;
+} ctmhe_estimator;
+
+typedef struct {              /* one update: what is known, and where the results go */
+  double start, end;          /* of the window, seconds */
+  double last_end, since;     /* time of the last estimate; from when on this one defines the estimated trajectory */
+  int growing;                /* the window starts at t0: the prior is `prior` */
+  int capacity;               /* slots that there is room for */
+  int y_count, u_count, path_count, last_n;
+  const double *y_t, *y;      /* (y_count), (y_count, ny) measurements up to the end, NaN missing */
+  const double *u_t, *u;      /* (u_count), (u_count, nu) inputs */
+  const double *path_t, *path; /* (path_count), (path_count, width): the estimated trajectory, a slot a row */
+  const double *prior, *p;    /* (nx + np), (np) of the last estimate */
+  const double *last;         /* the last solution's blocks, or NULL */
+  const int8_t *last_active;
+  double *values;             /* out: blocks in the order of solved.py */
+  int8_t *active;
+  double *path_times, *path_rows; /* out: what this solution adds to the path */
+  int n, path_added, measured; /* out */
+} ctmhe_request;
+
+enum ctmhe_outcome {          /* besides ctmhe_stop: why there was no solve */
+  CTMHE_ELSEWHERE = -1,       /* not covered here: the caller's own assembly decides */
+  CTMHE_TOO_SMALL = -2        /* more slots than `capacity`: request->n says how many */
+};
+
+/* Bytes of scratch for updates of up to `capacity` slots, and doubles of a row of the path. */
+size_t ctmhe_update_size(const ctmhe_stage *stage, int capacity);
+
+/* Assemble the window and its guess into `window` and `result` (whose pointers it sets), without solving. Returns 0 or
+ * an outcome. */
+int ctmhe_assemble(const ctmhe_stage *stage, const ctmhe_estimator *estimator, ctmhe_request *request,
+                   ctmhe_window *window, ctmhe_result *result, void *scratch);
+
+/* Assemble and solve. Returns the stop code or an outcome. */
+int ctmhe_update(const ctmhe_stage *stage, const ctmhe_estimator *estimator, ctmhe_request *request,
+                 const ctmhe_options *options, ctmhe_window *window, ctmhe_result *result, void *scratch);
+
 /* Bytes of scratch that a window of n slots needs. */
 size_t ctmhe_scratch_size(const ctmhe_stage *stage, int n);
 

@@ -1,0 +1,216 @@
+"""The core as ctypes sees it: the structures of core.h, the model's functions, loading and checking a library."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from ctmhe.errors import SolverError
+from ctmhe.transcription.stage import StageFunction
+
+VERSION = 2
+MAX_ARGUMENTS = 64
+CONVERGED, ITERATION_LIMIT, NOT_FINITE, NO_DECREASE, SINGULAR = range(5)
+STAGE_FUNCTIONS = ("ctmhe_stage_value", "ctmhe_stage_jacobian", "ctmhe_stage_curvature")
+
+_pointer, _int, _double = ctypes.c_void_p, ctypes.c_int, ctypes.c_double
+_eval_type = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
+_get_pointer = ctypes.pythonapi.PyCapsule_GetPointer
+_get_pointer.restype, _get_pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
+
+
+class Function(ctypes.Structure):
+    """A stage function and its memory."""
+
+    _fields_ = [
+        ("function", _pointer), ("iw", _pointer), ("w", _pointer), ("eval", _pointer), ("self", _pointer),
+        ("failed", _pointer), ("arg", _pointer * 9), ("res", _pointer * 3),
+    ]  # fmt: skip
+
+
+class Stage(ctypes.Structure):
+    """The model's functions and sizes."""
+
+    _fields_ = [
+        *((name, _int) for name in ("nx", "nw", "np", "nu", "ny", "q", "symbolic")),
+        *((name, Function) for name in ("value", "jacobian", "curvature")),
+    ]
+
+
+WINDOW_ARRAYS = (
+    "t", "h", "shared", "u0", "u1", "prior", "L_prior", "L_w", "L_y", "y_data", "x_lower", "x_upper", "w_lower",
+    "w_upper", "y_lower", "y_upper", "p_lower", "p_upper", "x_scale", "w_scale", "p_scale", "y_scale",
+)  # fmt: skip
+RESULT_ARRAYS = (
+    "x", "w", "p", "x_active", "w_active", "y_active", "p_active", "y", "dynamics_multiplier", "x_multiplier",
+    "w_multiplier", "y_multiplier", "p_multiplier",
+)  # fmt: skip
+
+
+class WindowHeader(ctypes.Structure):
+    """One window's arrays."""
+
+    _fields_ = [
+        *((name, _int) for name in ("n", "p_estimated", "output_bounded")),
+        *((name, _pointer) for name in WINDOW_ARRAYS),
+    ]
+
+
+class Options(ctypes.Structure):
+    """What the solver is told."""
+
+    _fields_ = [("max_iterations", _int), ("tolerance", _double), ("accuracy", _double)]
+
+
+class ResultHeader(ctypes.Structure):
+    """Guess in, solution out."""
+
+    _fields_ = [
+        *((name, _pointer) for name in RESULT_ARRAYS),
+        *((name, _double) for name in ("cost", "optimality", "feasibility")),
+        *((name, _int) for name in ("stop", "iterations", "factorizations")),
+    ]
+
+
+NUMBERS = ("interval", "hold_limit", "rate", "prior_rate")
+SWITCHES = ("parts", "discrete", "filtering", "end_slot", "input_linear", "p_estimated", "diagonal_R", "diagonal_point")
+CONSTANTS = (
+    "held", "linear", "nodes", "shares", "root_P", "root_Q", "root_R", "root_point", "root_S", "x_lower", "x_upper",
+    "w_lower", "w_upper", "y_lower", "y_upper", "residual_lower", "residual_upper", "p_lower", "p_upper", "x_scale",
+    "w_scale", "p_scale", "y_scale",
+)  # fmt: skip
+
+
+class EstimatorHeader(ctypes.Structure):
+    """What does not change from update to update."""
+
+    _fields_ = [
+        *((name, _double) for name in NUMBERS),
+        *((name, _int) for name in SWITCHES),
+        *((name, _pointer) for name in CONSTANTS),
+    ]
+
+
+class RequestHeader(ctypes.Structure):
+    """One update: what is known, and where the results go."""
+
+    _fields_ = [
+        *((name, _double) for name in ("start", "end", "last_end", "since")),
+        *((name, _int) for name in ("growing", "capacity", "y_count", "u_count", "path_count", "last_n")),
+        *(
+            (name, _pointer)
+            for name in (
+                "y_t", "y", "u_t", "u", "path_t", "path", "prior", "p", "last", "last_active", "values", "active",
+                "path_times", "path_rows",
+            )
+        ),
+        *((name, _int) for name in ("n", "path_added", "measured")),
+    ]  # fmt: skip
+
+
+class Functions:
+    """The stage's functions as the core calls them, with their memory."""
+
+    def __init__(self, core: ctypes.CDLL, stage: StageFunction):
+        self.kept: list[Any] = []
+        functions = [group[1] for group in stage.mapped]
+        structures = []
+        for name, function in zip(STAGE_FUNCTIONS, functions, strict=False):
+            exported = getattr(core, name, None)
+            structures.append(self._virtual(stage, function) if exported is None else self._compiled(core, name))
+        self.structure = Stage(
+            stage.nx, stage.nw, stage.np, stage.nu, stage.ny, stage.q, bool(stage.symbolic), *structures
+        )
+
+    def _compiled(self, core: ctypes.CDLL, name: str) -> Function:
+        sizes = (ctypes.c_longlong * 4)()
+        getattr(core, f"{name}_work")(*(ctypes.byref(sizes, 8 * i) for i in range(4)))
+        if max(sizes[0], sizes[1]) > MAX_ARGUMENTS:
+            raise SolverError(
+                f"the compiled function {name} needs {max(sizes[0], sizes[1])} pointers; rebuild the core"
+            )
+        iw, w = np.zeros(sizes[2] + 1, np.int64), np.zeros(sizes[3] + 1)
+        self.kept += [iw, w]
+        address = ctypes.cast(getattr(core, name), ctypes.c_void_p).value
+        return Function(function=address, iw=iw.ctypes.data, w=w.ctypes.data)
+
+    def _virtual(self, stage: StageFunction, function: ca.Function) -> Function:
+        inputs = [np.zeros(max(function.nnz_in(i), 1)) for i in range(function.n_in())]
+        outputs = [np.zeros(max(function.nnz_out(i), 1)) for i in range(function.n_out())]
+        buffer, trigger = function.buffer()
+        for i, array in enumerate(inputs):
+            if function.nnz_in(i):
+                buffer.set_arg(i, memoryview(array))  # pyright: ignore
+        for i, array in enumerate(outputs):
+            if function.nnz_out(i):
+                buffer.set_res(i, memoryview(array))  # pyright: ignore
+        self.kept += [inputs, outputs, buffer, trigger]
+        structure = Function(
+            arg=(_pointer * 9)(*(array.ctypes.data for array in inputs)),
+            res=(_pointer * 3)(*(array.ctypes.data for array in outputs)),
+        )
+        direct = _casadi_eval()
+        if stage.symbolic and direct is not None:  # expressions cannot fail: call CasADi directly
+            structure.eval = direct
+            structure.self = _get_pointer(buffer._self(), None)  # pyright: ignore
+        else:  # an integrator or an FMU raises, which must not pass through C
+            failed = np.zeros(1, np.int32)
+            callback = _eval_type(_guarded(trigger, buffer, failed))
+            self.kept += [failed, callback]
+            structure.failed = failed.ctypes.data
+            structure.eval = ctypes.cast(callback, ctypes.c_void_p).value
+        return structure
+
+
+@cache
+def _casadi_eval() -> int | None:
+    """Return the address of CasADi's `_function_buffer_eval(void*)`, or None where its name is another."""
+    folder = Path(ca.__file__).parent  # the extension module first: its handle finds the library it is linked to
+    for path in (*folder.glob("_casadi.*"), *folder.glob("libcasadi.*")):
+        try:
+            function = ctypes.CDLL(str(path))["_ZN6casadi21_function_buffer_evalEPv"]
+        except (OSError, AttributeError):
+            continue
+        return ctypes.cast(function, ctypes.c_void_p).value
+    return None
+
+
+def _guarded(trigger: Callable[[], None], buffer: Any, failed: np.ndarray) -> Callable[[Any], None]:
+    def run(_: Any) -> None:
+        try:
+            trigger()
+            failed[0] = buffer.ret() != 0
+        except Exception:
+            failed[0] = 1
+
+    return run
+
+
+def load(library: Path) -> ctypes.CDLL:
+    """Load a core and declare its functions."""
+    core = ctypes.CDLL(str(library))
+    core.ctmhe_scratch_size.argtypes, core.ctmhe_scratch_size.restype = [_pointer, _int], ctypes.c_size_t
+    core.ctmhe_solve.argtypes, core.ctmhe_solve.restype = [_pointer] * 5, _int
+    core.ctmhe_update_size.argtypes, core.ctmhe_update_size.restype = [_pointer, _int], ctypes.c_size_t
+    core.ctmhe_assemble.argtypes, core.ctmhe_assemble.restype = [_pointer] * 6, _int
+    core.ctmhe_update.argtypes, core.ctmhe_update.restype = [_pointer] * 7, _int
+    core.ctmhe_sizes.argtypes, core.ctmhe_sizes.restype = [_pointer] * 6, None
+    return core
+
+
+def check_sizes(core: ctypes.CDLL, stage: StageFunction, library: Path) -> None:
+    """Raise `SolverError` unless a library is this version's core, for any sizes or for those of the model."""
+    values = (_int * 6)()
+    core.ctmhe_sizes(*(ctypes.addressof(values) + 4 * i for i in range(6)))
+    *sizes, version = values
+    if version != VERSION:
+        raise SolverError(f"{library} is version {version} of the core, not {VERSION}; rebuild it")
+    wanted = [stage.nx, stage.nw, stage.np, stage.ny, stage.q]
+    if any(sizes) and sizes != wanted:
+        raise SolverError(f"{library} was compiled for nx, nw, np, ny, q = {sizes}, the model has {wanted}; rebuild it")
