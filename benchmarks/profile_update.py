@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.problems import PROBLEMS, SCALING, Problem
-from benchmarks.reference import accepts, build, grow, observe
+from benchmarks.reference import build, grow, observe
 
 PARTS: dict[str, tuple[str, ...]] = {
     "model functions": (

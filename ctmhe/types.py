@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
+from math import isfinite
 from typing import Any, Protocol
 
 import numpy as np
@@ -35,16 +36,20 @@ def positive(what: str, value: Any, unit: str = "") -> float:
     return number
 
 
-def _vector(values: Any, what: str) -> Any:
+def _vector(values: Any, what: str, t: float) -> Any:
     """Return values as a read-only vector, mappings unchanged; anything that is not numeric raises."""
-    if isinstance(values, Mapping):
+    if type(values) is not np.ndarray and isinstance(values, Mapping):
         return values
     try:
         if values is None:
             raise TypeError
-        return frozen(np.atleast_1d(np.asarray(values, dtype=np.float64)))
+        array = np.array(values, dtype=np.float64, ndmin=1)
+        array.flags.writeable = False
+        return array
     except (TypeError, ValueError):
-        raise InputError(f"{what}: values must be numbers or a mapping from names to numbers, got {values!r}") from None
+        raise InputError(
+            f"{what} at t = {t:g}: values must be numbers or a mapping from names to numbers, got {values!r}"
+        ) from None
 
 
 def finite_time(t: Any, what: str) -> float:
@@ -53,7 +58,7 @@ def finite_time(t: Any, what: str) -> float:
         value = float(t)
     except (TypeError, ValueError):
         raise InputError(f"{what}: time must be a number of seconds, got {t!r}") from None
-    if not np.isfinite(value):
+    if not isfinite(value):
         raise InputError(f"{what}: time must be finite, got {value}")
     return value
 
@@ -76,7 +81,7 @@ class Measurement:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "t", finite_time(self.t, "Measurement"))
-        object.__setattr__(self, "y", _vector(self.y, f"Measurement at t = {self.t:g}"))
+        object.__setattr__(self, "y", _vector(self.y, "Measurement", self.t))
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +101,7 @@ class Input:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "t", finite_time(self.t, "Input"))
-        object.__setattr__(self, "u", _vector(self.u, f"Input at t = {self.t:g}"))
+        object.__setattr__(self, "u", _vector(self.u, "Input", self.t))
 
 
 Box = tuple[ArrayLike, ArrayLike] | Mapping[str, tuple[float, float]] | None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from threading import Lock
 from typing import Any, Literal
@@ -14,6 +15,7 @@ from ctmhe.errors import InputError
 from ctmhe.types import Array, frozen
 
 SMALLEST = 64  # rows for which a log has room at least
+FEW = 8  # rows that are looked at one by one before a search
 
 
 class _Shared:
@@ -48,7 +50,7 @@ class Log:
         self.width = width
         self._shared = _Shared(np.empty(0), np.empty((0, width)), SMALLEST) if _shared is None else _shared
         self._start, self._stop = _start, _stop
-        self.last_time = self._shared.times.item(_stop - 1) if _stop > _start else -np.inf
+        self.last_time: float = self._shared.times.item(_stop - 1) if _stop > _start else -inf
 
     @classmethod
     def of(cls, times: Sequence[float] | Array, rows: Array, width: int) -> Log:
@@ -130,28 +132,32 @@ class Log:
 
     def drop_before(self, t: float, *, keep_holding: bool = False) -> Log:
         """Return the log without rows older than `t`; `keep_holding` keeps the last of them, which still holds."""
-        start = self._position(t)
-        if keep_holding and start > self._start and (start == self._stop or self._shared.times[start] > t):
+        times, start, stop = self._shared.times, self._start, self._stop
+        for _ in range(FEW):
+            if start == stop or times.item(start) >= t:
+                break
+            start += 1
+        else:
+            start = self._position(t)
+        if keep_holding and start > self._start and (start == stop or times.item(start) > t):
             start -= 1
         return self._from(start)
 
-    def drop_first(self, count: int) -> Log:
-        """Return the log without its first `count` rows."""
-        return self._from(self._start + count)
-
     def _from(self, start: int) -> Log:
+        if start == self._start:
+            return self
         live = self._stop - start
-        if start > self._start and self.capacity > max(SMALLEST, 8 * live):  # do not keep what is long gone
+        if len(self._shared.times) > max(SMALLEST, 8 * live):  # do not keep what is long gone
             times, rows = self._shared.times[start : self._stop], self._shared.rows[start : self._stop]
             return Log(self.width, _Shared(times, rows, max(SMALLEST, 2 * live)), 0, live)
-        return Log(self.width, self._shared, start, self._stop) if start > self._start else self
+        return Log(self.width, self._shared, start, self._stop)
 
     def drop_after(self, t: float) -> Log:
         """Return the log without rows newer than `t`."""
         stop = self._position(t, "right")
         return Log(self.width, self._shared, self._start, stop) if stop < self._stop else self
 
-    def arrays(self, until: float = np.inf, *, beyond: int = 0) -> tuple[Array, Array]:
+    def arrays(self, until: float = inf, *, beyond: int = 0) -> tuple[Array, Array]:
         """Return times (n,) and rows (n, width) up to and including `until`, and `beyond` rows after it."""
         stop = self._start + self.count_until(until, beyond=beyond)
         return self._shared.times[self._start : stop].copy(), self._shared.rows[self._start : stop].copy()

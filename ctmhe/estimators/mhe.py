@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -260,7 +260,7 @@ class MHE:
         t = measurement.t
         row = self.model.y.vector(measurement.y, f"measurement at t = {t:g}", missing=np.nan, allow_nan=True)
         self._check_age(state, t, "measurement")
-        if not np.isfinite(row).any():
+        if row is not measurement.y and not np.isfinite(row).any():
             return state
         self._check_step(t, "measurement")
         known = state.measurements.find(t)
@@ -273,8 +273,8 @@ class MHE:
                     f"but was {known[i]:g} at the "
                     "same time; give each sample its own time"
                 )
-            row = frozen(np.where(np.isfinite(row), row, known))
-        return replace(state, measurements=state.measurements.put(t, row))
+            row = np.where(np.isfinite(row), row, known)
+        return state.knowing(state.measurements.put(t, row), state.inputs)
 
     def control(self, state: State, value: Input) -> State:
         """Return the state that also knows the input from `value.t` on; at one time the last one given counts."""
@@ -284,7 +284,7 @@ class MHE:
         u = self.model.u.vector(value.u, f"input at t = {value.t:g}")
         if state.solves:
             self._check_age(state, value.t, "input")
-        return replace(state, inputs=state.inputs.put(value.t, u))
+        return state.knowing(state.measurements, state.inputs.put(value.t, u))
 
     def _slack(self, t: float) -> float:
         """Return the difference below which two times near `t` are the same."""

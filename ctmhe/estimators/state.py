@@ -55,6 +55,13 @@ class State:
     window: Solved | None = None
     solves: int = 0
 
+    def knowing(self, measurements: Log, inputs: Log) -> State:
+        """Return the state with other logs."""
+        return State(
+            self.t0, self.t, self.start, self.x, self.p, measurements, inputs, self.path, self.since, self.window,
+            self.solves,
+        )  # fmt: skip
+
 
 def save_state(state: State, path: str | Path, fingerprint: dict[str, Any]) -> None:
     """Write a state to a versioned `.npz` file (no pickle inside), in one atomic step."""

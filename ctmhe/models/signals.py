@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
+from math import isfinite
 from typing import Any
 
 import numpy as np
@@ -71,7 +72,15 @@ class Signals:
         `missing` fills names left out of a mapping; None makes them an error. Infinite values always raise, NaN unless
         `allow_nan`.
         """
-        n = len(self)
+        n = len(self.names)
+        if (
+            type(values) is np.ndarray
+            and values.shape == (n,)
+            and values.dtype == np.float64
+            and not (values.flags.writeable or values.base is not None)
+            and isfinite(values.dot(values))
+        ):
+            return values  # the vector of a Measurement or an Input, without gaps
         if isinstance(values, Mapping):
             vector = np.full(n, np.nan if missing is None else missing)
             given = set()

@@ -185,7 +185,10 @@ class _Memory:
         if inputs.last_time > span[1]:
             request.u_count = inputs.count_until(span[1], beyond=int(self.assembly.input_linear))
         request.path_t, request.path, request.path_count = path.memory
-        self.start[:], self.p[:] = known
+        if growing:
+            self.start[:] = known[0]
+        if self.p.size:
+            self.p[:] = known[1]
         if last is None:
             request.last = request.last_active = None
         else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import ulp
 
 import numpy as np
 
@@ -13,7 +14,7 @@ ROUND_OFF = 1e-9  # times the shooting interval: edges closer than this are the 
 
 def same_time(interval: float, t: float) -> float:
     """Return how close two times near `t` must be to count as one: round-off of the interval or of the clock."""
-    return max(ROUND_OFF * interval, 8 * float(np.spacing(abs(t))))
+    return max(ROUND_OFF * interval, 8 * ulp(t))
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,6 @@ typedef struct {
   const ctmhe_stage *s;
   const ctmhe_estimator *e;
   const ctmhe_request *r;
-  int nx, nw, np, nu, ny, q;
   int n;                        /* slots */
   double tolerance;             /* seconds: closer instants are the same */
   double *edge;                 /* (capacity + 2) */
@@ -58,8 +57,8 @@ static double same_time(double interval, double t) {
 
 /* Whether a row of measurements says anything: about any sensor, or about those that are not held. */
 static int speaks(const assembly *a, int row, int point_only) {
-  const double *y = a->r->y + (size_t)row * (size_t)a->ny;
-  for (int i = 0; i < a->ny; i++)
+  const double *y = a->r->y + (size_t)row * (size_t)NY(a->s);
+  for (int i = 0; i < NY(a->s); i++)
     if (y[i] == y[i] && !(point_only && a->e->held[i])) return 1;
   return 0;
 }
@@ -69,10 +68,10 @@ static void next_expiry(assembly *a, int sensor) {
   const ctmhe_request *r = a->r;
   int i = a->row[sensor];
   a->cursor[sensor] = HUGE_VAL;
-  while (i < r->y_count && r->y[i * a->ny + sensor] != r->y[i * a->ny + sensor]) i++;
+  while (i < r->y_count && r->y[i * NY(a->s) + sensor] != r->y[i * NY(a->s) + sensor]) i++;
   while (i < r->y_count) {
     int j = i + 1;
-    while (j < r->y_count && r->y[j * a->ny + sensor] != r->y[j * a->ny + sensor]) j++;
+    while (j < r->y_count && r->y[j * NY(a->s) + sensor] != r->y[j * NY(a->s) + sensor]) j++;
     const double end = r->y_t[i] + a->e->hold_limit;
     i = j;
     if (j == r->y_count || r->y_t[j] > end) {
@@ -111,7 +110,7 @@ static int mesh_edges(assembly *a, int *at_start) {
   const double last = ceil(end / interval * parts), low = start + tolerance, high = end - tolerance;
   double cell = floor(k / parts), part = k - cell * parts, before = -HUGE_VAL;
   int i = 0, j = 0;
-  for (int s = 0; s < a->ny; s++) {
+  for (int s = 0; s < NY(a->s); s++) {
     a->cursor[s] = HUGE_VAL;
     a->row[s] = 0;
     if (e->held[s])
@@ -126,7 +125,7 @@ static int mesh_edges(assembly *a, int *at_start) {
     double next = step < sample ? step : sample;
     int from = -1;
     if (input < next) next = input;
-    for (int s = 0; s < a->ny; s++)
+    for (int s = 0; s < NY(a->s); s++)
       if (a->cursor[s] < next) next = a->cursor[s], from = s;
     if (!(next < high)) break;
     if (next > low) {
@@ -175,10 +174,11 @@ static int build_mesh(assembly *a) {
   a->tolerance = same_time(e->interval, a->r->end);
   const int n = e->discrete ? mesh_steps(a) : mesh_edges(a, &at_start);
   if (n < 0 || n > a->r->capacity) return n;
-  double cell = 0.0;
+  int64_t cell = 0;
   for (int i = n - 1; i >= 0; i--) {
     a->h[i] = a->edge[i + 1] - a->edge[i];
-    const double here = floor((a->edge[i] + 0.5 * a->h[i]) / e->interval + 1e-9);
+    const double at = (a->edge[i] + 0.5 * a->h[i]) / e->interval + 1e-9;
+    const int64_t here = (int64_t)at - (at < (double)(int64_t)at); /* floor */
     a->shared[i] = (uint8_t)(!e->discrete && i + 1 < n && here == cell);
     cell = here;
   }
@@ -190,7 +190,7 @@ static int build_mesh(assembly *a) {
 
 static void known_inputs(const assembly *a, double *u0, double *u1) {
   const ctmhe_request *r = a->r;
-  const int nu = a->nu, last = r->u_count - 1;
+  const int nu = a->s->nu, last = r->u_count - 1;
   int i = 0;
   for (int k = 0; k < a->n; k++) {
     const double start = a->edge[k], end = a->edge[k + 1];
@@ -216,7 +216,8 @@ static void known_inputs(const assembly *a, double *u0, double *u1) {
 /* 1 - exp(-z), accurate for small z too. */
 static double grown(double z) {
   if (z > 0.02) return -expm1(-z);
-  return z * (1.0 - z / 2 * (1.0 - z / 3 * (1.0 - z / 4 * (1.0 - z / 5 * (1.0 - z / 6 * (1.0 - z / 7))))));
+  const double a = 1.0 / 6, b = 1.0 / 24, c = 1.0 / 120, d = 1.0 / 720;
+  return z * (1.0 - z * (0.5 - z * (a - z * (b - z * (c - z * d)))));
 }
 
 /* The share of a discrete model's step k in the discounted sum. */
@@ -229,12 +230,13 @@ static double step_weight(const assembly *a, int k) {
 
 static void disturbance_weights(assembly *a) {
   const ctmhe_estimator *e = a->e;
-  const int nw = a->nw;
+  const int nw = NW(a->s);
+  const double length = e->rate < 1e-200 ? 0.0 : 1.0 / e->rate;
   for (int k = 0; k < a->n && nw; k++) {
     const double h = a->h[k];
-    const double weight = e->discrete        ? step_weight(a, k)
-                          : e->rate < 1e-200 ? h
-                                             : exp(-e->rate * (a->r->end - a->edge[k] - h)) * grown(e->rate * h) / e->rate;
+    const double weight = e->discrete     ? step_weight(a, k)
+                          : length == 0.0 ? h
+                                          : exp(-e->rate * (a->r->end - a->edge[k] - h)) * grown(e->rate * h) * length;
     const double root = sqrt(weight);
     double *L = a->L_w + (size_t)k * (size_t)(nw * nw);
     for (int i = 0; i < nw * nw; i++) L[i] = root * e->root_Q[i];
@@ -243,7 +245,7 @@ static void disturbance_weights(assembly *a) {
 
 /* L = factor times the root of a weight on the sensors that are known. Returns nonzero where Python has to. */
 static int weigh(const assembly *a, double *L, const double *root, int diagonal, const uint8_t *known, double factor) {
-  const int ny = a->ny;
+  const int ny = NY(a->s);
   int some = 0, all = 1;
   for (int i = 0; i < ny; i++) known[i] ? (some = 1) : (all = 0);
   for (int i = 0; i < ny * ny; i++) L[i] = all ? factor * root[i] : 0.0;
@@ -258,7 +260,7 @@ static int weigh(const assembly *a, double *L, const double *root, int diagonal,
 static void held_signal(assembly *a, int sensor) {
   const ctmhe_estimator *e = a->e;
   const ctmhe_request *r = a->r;
-  const int ny = a->ny, q = a->q;
+  const int ny = NY(a->s), q = NQ(a->s);
   int i = -1, next = 0; /* rows of the sample that holds, and of the one after it */
   while (next < r->y_count && r->y[next * ny + sensor] != r->y[next * ny + sensor]) next++;
   for (int k = 0; k < a->n; k++) {
@@ -299,9 +301,9 @@ static int nearest_edge(const assembly *a, int from, int count, double t) {
 static int outputs(assembly *a) {
   const ctmhe_estimator *e = a->e;
   const ctmhe_request *r = a->r;
-  const int n = a->n, ny = a->ny, q = a->q;
-  memset(a->y_data, 0, sizeof(double) * (size_t)(n * q * ny));
-  memset(a->known, 0, (size_t)(n * ny));
+  const int n = a->n, ny = NY(a->s), q = NQ(a->s);
+  memset(a->y_data, 0, sizeof(double) * (size_t)n * (size_t)(q * ny));
+  memset(a->known, 0, (size_t)n * (size_t)ny);
   for (int i = 0; i < n * ny; i++) a->count[i] = 0.0;
   for (int s = 0; s < ny; s++)
     if (e->held[s]) held_signal(a, s);
@@ -356,9 +358,9 @@ static int outputs(assembly *a) {
 
 static int outputs_at_steps(assembly *a) {
   const ctmhe_estimator *e = a->e;
-  const int n = a->n, ny = a->ny;
-  memset(a->y_data, 0, sizeof(double) * (size_t)(n * ny));
-  memset(a->known, 0, (size_t)(n * ny));
+  const int n = a->n, ny = NY(a->s);
+  memset(a->y_data, 0, sizeof(double) * (size_t)n * (size_t)ny);
+  memset(a->known, 0, (size_t)n * (size_t)ny);
   FOR_ROWS_ON_EDGES(n) {
     for (int s = 0; s < ny; s++) {
       const double y = a->r->y[row * ny + s];
@@ -376,9 +378,9 @@ static int outputs_at_steps(assembly *a) {
 /* The terminal weight (diagonal) joins that of the last output. */
 static void terminal_weight(assembly *a) {
   const ctmhe_estimator *e = a->e;
-  const int n = a->n, ny = a->ny;
+  const int n = a->n, ny = NY(a->s);
   if (!e->root_S || (e->discrete && a->h[n - 1] != 0.0)) return;
-  double *L = a->L_y + (size_t)((n * a->q - 1) * ny * ny);
+  double *L = a->L_y + (size_t)((n * NQ(a->s) - 1) * ny * ny);
   for (int i = 0; i < ny; i++)
     if (a->known[(n - 1) * ny + i]) {
       const double one = L[i * (ny + 1)], other = e->root_S[i * (ny + 1)];
@@ -389,7 +391,7 @@ static void terminal_weight(assembly *a) {
 /* Boxes on every slot; returns whether any bound of an output is finite. */
 static int bounds(assembly *a) {
   const ctmhe_estimator *e = a->e;
-  const int n = a->n, nx = a->nx, nw = a->nw, ny = a->ny, q = a->q;
+  const int n = a->n, nx = NX(a->s), nw = NW(a->s), ny = NY(a->s), q = NQ(a->s);
   int finite = 0;
   for (int k = 0; k <= n; k++)
     for (int i = 0; i < nx; i++) a->x_lower[k * nx + i] = e->x_lower[i], a->x_upper[k * nx + i] = e->x_upper[i];
@@ -427,10 +429,10 @@ static int carry(const assembly *a, double t, double h, const double *from, cons
     double *taken[CTMHE_MAX_ARGUMENTS];
     memcpy(given, arg, sizeof arg);
     taken[0] = next;
-    taken[1] = next + a->nx;
+    taken[1] = next + NX(a->s);
     if (f->function(given, taken, f->iw, f->w, 0)) return 1;
   } else {
-    const int length[7] = {1, 1, a->nx, a->nw, a->np, a->nu, a->nu};
+    const int length[7] = {1, 1, NX(a->s), NW(a->s), NP(a->s), a->s->nu, a->s->nu};
     for (int j = 0; j < 7; j++)
       for (int l = 0; l < length[j]; l++) f->arg[j][l] = arg[j][l];
     f->eval(f->self);
@@ -438,7 +440,7 @@ static int carry(const assembly *a, double t, double h, const double *from, cons
     next = f->res[0];
   }
   double finite = 0.0;
-  for (int i = 0; i < a->nx; i++) {
+  for (int i = 0; i < NX(a->s); i++) {
     finite += next[i] * 0.0;
     x[i] = next[i];
   }
@@ -446,7 +448,7 @@ static int carry(const assembly *a, double t, double h, const double *from, cons
 }
 
 /* A row of the path: start of the slot, from when on the row counts, x, w, u0, u1, p, x at its end. See priors.py. */
-static size_t path_width(const assembly *a) { return (size_t)(2 + 2 * a->nx + a->nw + 2 * a->nu + a->np); }
+static size_t path_width(const assembly *a) { return (size_t)(2 + 2 * NX(a->s) + NW(a->s) + 2 * a->s->nu + NP(a->s)); }
 
 /* x_hat(t) and p_hat(t) of the estimated trajectory (3.18). Returns nonzero where that is not kept. */
 static int filtering_prior(const assembly *a, double *prior) {
@@ -461,16 +463,16 @@ static int filtering_prior(const assembly *a, double *prior) {
     else low = middle + 1;
   }
   const double end = r->path_t[low], *row = r->path + (size_t)low * path_width(a), start = row[0];
-  const double *x = row + 2, *w = x + a->nx, *u0 = w + a->nw, *u1 = u0 + a->nu, *p = u1 + a->nu, *x_end = p + a->np;
+  const double *x = row + 2, *w = x + NX(a->s), *u0 = w + NW(a->s), *u1 = u0 + a->s->nu, *p = u1 + a->s->nu, *x_end = p + NP(a->s);
   if (t <= row[1] + slack) return 1;
   if (t > end) t = end;
-  for (int i = 0; i < a->np; i++) prior[a->nx + i] = p[i];
+  for (int i = 0; i < NP(a->s); i++) prior[NX(a->s) + i] = p[i];
   if (t == end || t <= start) {
-    for (int i = 0; i < a->nx; i++) prior[i] = t == end ? x_end[i] : x[i];
+    for (int i = 0; i < NX(a->s); i++) prior[i] = t == end ? x_end[i] : x[i];
     return 0;
   }
-  double *u = a->work + a->nx + a->q * a->ny;
-  for (int i = 0; i < a->nu; i++) u[i] = u0[i] + (u1[i] - u0[i]) * ((t - start) / (end - start));
+  double *u = a->work + NX(a->s) + NQ(a->s) * NY(a->s);
+  for (int i = 0; i < a->s->nu; i++) u[i] = u0[i] + (u1[i] - u0[i]) * ((t - start) / (end - start));
   return carry(a, start, t - start, x, w, p, u0, u, prior);
 }
 
@@ -482,29 +484,29 @@ static int all_finite(const double *x, int count) {
 
 /* The prior carried forward without disturbance, held where the model leaves its domain. */
 static void shifted_guess(const assembly *a, const ctmhe_window *win, ctmhe_result *g) {
-  const int nx = a->nx, nw = a->nw, n = a->n;
+  const int nx = NX(a->s), nw = NW(a->s), n = a->n;
   int good = 1;
   for (int i = 0; i < nx; i++) {
     const double x = win->prior[i], low = win->x_lower[i], high = win->x_upper[i];
     g->x[i] = x < low ? low : x > high ? high : x;
   }
   for (int i = 0; i < n * nw; i++) g->w[i] = 0.0;
-  for (int i = 0; i < a->np; i++) g->p[i] = win->prior[nx + i];
+  for (int i = 0; i < NP(a->s); i++) g->p[i] = win->prior[nx + i];
   for (int k = 0; k < n && good; k++)
-    good = !carry(a, a->edge[k], a->h[k], g->x + k * nx, g->w + k * nw, g->p, win->u0 + k * a->nu,
-                  win->u1 + k * a->nu, g->x + (k + 1) * nx);
+    good = !carry(a, a->edge[k], a->h[k], g->x + k * nx, g->w + k * nw, g->p, win->u0 + k * a->s->nu,
+                  win->u1 + k * a->s->nu, g->x + (k + 1) * nx);
   for (int k = 1; k <= n && !good; k++)
     for (int i = 0; i < nx; i++) g->x[k * nx + i] = g->x[i];
   memset(g->x_active, 0, (size_t)((n + 1) * nx));
   memset(g->w_active, 0, (size_t)(n * nw));
-  memset(g->y_active, 0, (size_t)(n * a->ny));
-  memset(g->p_active, 0, (size_t)a->np);
+  memset(g->y_active, 0, (size_t)(n * NY(a->s)));
+  memset(g->p_active, 0, (size_t)NP(a->s));
 }
 
 /* The last solution on the new mesh, carried forward behind its end, with its active set. */
 static void warm_start(const assembly *a, const ctmhe_window *win, ctmhe_result *g) {
   const ctmhe_request *r = a->r;
-  const int nx = a->nx, nw = a->nw, ny = a->ny, n = a->n, m = r->last_n;
+  const int nx = NX(a->s), nw = NW(a->s), ny = NY(a->s), n = a->n, m = r->last_n;
   const double *last_t = r->last, *last_x = last_t + m + 1, *last_w = last_x + (size_t)((m + 1) * nx);
   const int8_t *x_active = r->last_active, *w_active = x_active + (m + 1) * nx, *y_active = w_active + m * nw,
                *p_active = y_active + m * ny;
@@ -536,12 +538,12 @@ static void warm_start(const assembly *a, const ctmhe_window *win, ctmhe_result 
     const int covered = a->edge[k] <= end + a->tolerance;
     for (int i = 0; i < nx; i++) g->x_active[k * nx + i] = covered ? x_active[j * nx + i] : 0;
   }
-  for (int i = 0; i < a->np; i++) {
+  for (int i = 0; i < NP(a->s); i++) {
     g->p[i] = a->e->p_estimated ? r->p[i] : win->prior[nx + i];
     g->p_active[i] = p_active[i];
   }
   for (int k = old > 0 ? old - 1 : 0; k < n; k++)
-    if (carry(a, a->edge[k], a->h[k], g->x + k * nx, g->w + k * nw, g->p, win->u0 + k * a->nu, win->u1 + k * a->nu,
+    if (carry(a, a->edge[k], a->h[k], g->x + k * nx, g->w + k * nw, g->p, win->u0 + k * a->s->nu, win->u1 + k * a->s->nu,
               g->x + (k + 1) * nx)) {
       shifted_guess(a, win, g);
       return;
@@ -554,8 +556,8 @@ static void warm_start(const assembly *a, const ctmhe_window *win, ctmhe_result 
 /* Where the arrays of a window of n slots lie in the caller's two blocks, in the order of solved.py. */
 static void lay_out_result(const assembly *a, ctmhe_window *win, ctmhe_result *g) {
   const ctmhe_request *r = a->r;
-  const size_t n = (size_t)a->n, nx = (size_t)a->nx, nw = (size_t)a->nw, np = (size_t)a->np, nu = (size_t)a->nu;
-  const size_t ny = (size_t)a->ny, q = (size_t)a->q;
+  const size_t n = (size_t)a->n, nx = (size_t)NX(a->s), nw = (size_t)NW(a->s), np = (size_t)NP(a->s), nu = (size_t)a->s->nu;
+  const size_t ny = (size_t)NY(a->s), q = (size_t)NQ(a->s);
   double *at = r->values;
   int8_t *flag = r->active;
 #define PLACE(field, count) (field = at, at += (count))
@@ -585,21 +587,20 @@ static void lay_out_result(const assembly *a, ctmhe_window *win, ctmhe_result *g
 static int assemble(assembly *a, const ctmhe_stage *stage, const ctmhe_estimator *e, ctmhe_request *r, ctmhe_window *win,
                     ctmhe_result *g, char *scratch) {
   a->s = stage, a->e = e, a->r = r;
-  a->nx = stage->nx, a->nw = stage->nw, a->np = stage->np, a->nu = stage->nu, a->ny = stage->ny, a->q = stage->q;
   lay_out_assembly(a, scratch, stage, r->capacity);
-  if (a->nu && (!r->u_count || r->u_t[0] > r->start + same_time(e->interval, r->start))) return CTMHE_ELSEWHERE;
+  if (a->s->nu && (!r->u_count || r->u_t[0] > r->start + same_time(e->interval, r->start))) return CTMHE_ELSEWHERE;
   r->n = a->n = build_mesh(a);
   if (a->n < 1) return CTMHE_ELSEWHERE;
   if (a->n > r->capacity) return CTMHE_TOO_SMALL;
   lay_out_result(a, win, g);
   double *prior = (double *)win->prior;
-  if (r->growing) memcpy(prior, r->prior, sizeof(double) * (size_t)(a->nx + a->np));
+  if (r->growing) memcpy(prior, r->prior, sizeof(double) * (size_t)(NX(a->s) + NP(a->s)));
   else if (filtering_prior(a, prior)) return CTMHE_ELSEWHERE;
   known_inputs(a, (double *)win->u0, (double *)win->u1);
   disturbance_weights(a);
   if (e->discrete ? outputs_at_steps(a) : outputs(a)) return CTMHE_ELSEWHERE;
   terminal_weight(a);
-  const int width = a->nx + (e->p_estimated ? a->np : 0);
+  const int width = NX(a->s) + (e->p_estimated ? NP(a->s) : 0);
   const double factor = sqrt(exp(-e->prior_rate * (r->end - r->start)));
   for (int i = 0; i < width * width; i++) a->L_prior[i] = factor * e->root_P[i];
   win->n = a->n;
@@ -611,7 +612,7 @@ static int assemble(assembly *a, const ctmhe_stage *stage, const ctmhe_estimator
   win->y_lower = a->y_lower, win->y_upper = a->y_upper, win->p_lower = e->p_lower, win->p_upper = e->p_upper;
   win->x_scale = e->x_scale, win->w_scale = e->w_scale, win->p_scale = e->p_scale, win->y_scale = e->y_scale;
   r->measured = 0;
-  for (int i = 0; i < a->n * a->q * a->ny * a->ny && !r->measured; i++) r->measured = a->L_y[i] != 0.0;
+  for (int i = 0; i < a->n * NQ(a->s) * NY(a->s) * NY(a->s) && !r->measured; i++) r->measured = a->L_y[i] != 0.0;
   if (r->last && r->last[r->last_n] >= r->start) warm_start(a, win, g);
   else shifted_guess(a, win, g);
   return 0;
@@ -619,7 +620,7 @@ static int assemble(assembly *a, const ctmhe_stage *stage, const ctmhe_estimator
 
 /* The rows that this solution adds to the path: its slots behind `since`. */
 static void write_path(const assembly *a, const ctmhe_window *win, const ctmhe_result *g, ctmhe_request *r) {
-  const int nx = a->nx, nw = a->nw, nu = a->nu, n = a->n;
+  const int nx = NX(a->s), nw = NW(a->s), nu = a->s->nu, n = a->n;
   int first = 0;
   while (first < n - 1 && a->edge[first + 1] <= r->since) first++;
   r->path_added = 0;
@@ -633,7 +634,7 @@ static void write_path(const assembly *a, const ctmhe_window *win, const ctmhe_r
     for (int i = 0; i < nw; i++) *row++ = g->w[k * nw + i];
     for (int i = 0; i < nu; i++) *row++ = win->u0[k * nu + i];
     for (int i = 0; i < nu; i++) *row++ = win->u1[k * nu + i];
-    for (int i = 0; i < a->np; i++) *row++ = g->p[i];
+    for (int i = 0; i < NP(a->s); i++) *row++ = g->p[i];
     for (int i = 0; i < nx; i++) *row++ = g->x[(k + 1) * nx + i];
   }
 }
