@@ -302,9 +302,8 @@ static int outputs(assembly *a) {
   const ctmhe_estimator *e = a->e;
   const ctmhe_request *r = a->r;
   const int n = a->n, ny = NY(a->s), q = NQ(a->s);
-  memset(a->y_data, 0, sizeof(double) * (size_t)n * (size_t)(q * ny));
-  memset(a->known, 0, (size_t)n * (size_t)ny);
-  for (int i = 0; i < n * ny; i++) a->count[i] = 0.0;
+  for (int i = 0; i < n * q * ny; i++) a->y_data[i] = 0.0;
+  for (int i = 0; i < n * ny; i++) a->count[i] = 0.0, a->known[i] = 0;
   for (int s = 0; s < ny; s++)
     if (e->held[s]) held_signal(a, s);
   for (int k = 0; k < n; k++)
@@ -359,8 +358,7 @@ static int outputs(assembly *a) {
 static int outputs_at_steps(assembly *a) {
   const ctmhe_estimator *e = a->e;
   const int n = a->n, ny = NY(a->s);
-  memset(a->y_data, 0, sizeof(double) * (size_t)n * (size_t)ny);
-  memset(a->known, 0, (size_t)n * (size_t)ny);
+  for (int i = 0; i < n * ny; i++) a->y_data[i] = 0.0, a->known[i] = 0;
   FOR_ROWS_ON_EDGES(n) {
     for (int s = 0; s < ny; s++) {
       const double y = a->r->y[row * ny + s];
