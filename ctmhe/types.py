@@ -205,6 +205,7 @@ class Outcome(Enum):
     SOLVED = "solved"
     FALLBACK = "solved by the reference solver"
     ITERATION_LIMIT = "stopped at the iteration limit: the best iterate so far; raise max_iterations"
+    DEADLINE = "stopped at the deadline: the best iterate so far; allow more seconds or shorten the window"
     RELAXED = "bounds had to be relaxed; the violation is reported: check the bounds against the data"
     PREDICTED = "no solver succeeded: open-loop prediction; check model, bounds and data"
 
@@ -230,6 +231,8 @@ class Status:
         The failure ladder as far as it was climbed, each with its reason.
     notes : tuple of str
         Facts about the window: `no measurement in window`, `prior predicted, uncertified`.
+    factorizations : int
+        Of the rung that ended.
     """
 
     outcome: Outcome
@@ -240,6 +243,7 @@ class Status:
     violation: float = 0.0
     rungs: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    factorizations: int = 0
 
     def __str__(self) -> str:
         return "; ".join((self.outcome.value, *self.rungs, *self.notes))
@@ -330,6 +334,19 @@ class Estimate:
     def prior(self) -> Array:
         """The prior estimate (nx + np,) at the window's left edge."""
         return self._solved.part("prior")
+
+    @property
+    def active(self) -> dict[str, np.ndarray]:
+        """Bounds active at the solution, -1 (lower), 0, +1 (upper): `x` (N+1, nx), `w` (N, nw), `y` (N, ny), `p`."""
+        return {key: self._solved.part(f"{key}_active") for key in "xwyp"}
+
+    @property
+    def multipliers(self) -> dict[str, Array]:
+        """Lagrange multipliers in scaled variables for the cost J / 2: `dynamics` (N, nx), and bounds as in `active`.
+
+        Positive at upper bounds, negative at lower ones.
+        """
+        return {key: self._solved.part(f"{key}_multiplier") for key in ("dynamics", *"xwyp")}
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle the numbers; the covariance, which would need the window's functions, stays behind."""

@@ -24,6 +24,7 @@ from ctmhe.solvers.gauss_newton import GaussNewton
 from ctmhe.solvers.ipopt import Ipopt
 from ctmhe.solvers.ladder import climb
 from ctmhe.solvers.updates import CompiledUpdates
+from ctmhe.solvers.verification import verify as check
 from ctmhe.transcription.assembly import Assembly, Records, hold_kinds
 from ctmhe.transcription.grid import Mesh, same_time
 from ctmhe.transcription.integrators import Integrator, StepMap
@@ -104,7 +105,13 @@ class MHE:
         `auto` compiles the model's functions together with the core, where a C compiler is found and they can be
         generated: once per model, in seconds, cached on disk. `off` evaluates them in CasADi's virtual machine. When
         left out, `$CTMHE_COMPILE`, else `auto`.
-    max_iterations : int
+    max_iterations : int, optional
+        Real time: stop after so many iterations and take the iterate for the estimate, `Outcome.ITERATION_LIMIT`; 1 is
+        the real-time iteration. When left out, iterate until converged, and where 50 are not enough ask others.
+    deadline : float, optional
+        Real time: seconds by `clock` after which a solve stops between two iterations, `Outcome.DEADLINE`.
+    verify : bool
+        Check every converged solve against IPOPT; for tests.
     clock : callable, optional
         Seconds, for `Estimate.seconds`.
 
@@ -131,7 +138,9 @@ class MHE:
         longest_wait: float | None = None,
         solver: str = "gauss-newton",
         compile: str | None = None,
-        max_iterations: int = 50,
+        max_iterations: int | None = None,
+        deadline: float | None = None,
+        verify: bool = False,
         clock: Callable[[], float] = time.perf_counter,
     ):
         given = locals()
@@ -141,8 +150,13 @@ class MHE:
             raise InputError(f"model must be a ContinuousModel, DiscreteModel or FmuModel, got {type(model).__name__}")
         if bounds is not None and not isinstance(bounds, Bounds):
             raise InputError(f"bounds must be a Bounds(x=..., w=..., p=..., y=..., residual=...), got {bounds!r}")
-        if not (isinstance(max_iterations, int) and max_iterations > 0):
+        if not (max_iterations is None or (isinstance(max_iterations, int) and max_iterations > 0)):
             raise InputError(f"max_iterations must be a positive integer, got {max_iterations!r}")
+        if deadline is not None:
+            deadline = positive("deadline", deadline, "seconds")
+        self._real_time = max_iterations is not None or deadline is not None
+        if self._real_time and solver == "ipopt":
+            raise InputError("max_iterations and deadline are for Gauss-Newton; IPOPT runs to convergence")
         self.horizon = positive("horizon", horizon, "seconds")
         if model.step is not None:
             if integrator is not None:
@@ -183,19 +197,21 @@ class MHE:
             input_hold=input_hold,
             filtering=filtering,
         )
-        self._gauss_newton = GaussNewton(self.stage, max_iterations=max_iterations)
+        limits: dict[str, Any] = {"max_iterations": max_iterations or 50, "deadline": deadline, "clock": clock}
+        self._gauss_newton = GaussNewton(self.stage, **limits)
         self._reference = Ipopt(self.stage)
         compile = compile or os.environ.get("CTMHE_COMPILE") or "auto"
         if compile not in ("off", "auto"):
             raise InputError(f"compile must be 'off' or 'auto', got {compile!r}")
         self._solver: Solver = self._reference if solver == "ipopt" else self._gauss_newton
         if solver == "gauss-newton":
-            compiled = compiled_solver(self.stage, specialise=compile == "auto", max_iterations=max_iterations)
+            compiled = compiled_solver(self.stage, specialise=compile == "auto", **limits)
             self._solver = compiled or self._gauss_newton
         self._layout = Layout.of(self.stage)
         self._updates = None
         if isinstance(self._solver, CompiledGaussNewton) and CompiledUpdates.covers(self.assembly):
-            self._updates = CompiledUpdates(self._solver, self.assembly, self._layout)
+            self._updates = CompiledUpdates(self._solver, self.assembly, self._layout, real_time=self._real_time)
+        self._check = Ipopt(self.stage, options={"ipopt.mu_init": 1e-8}) if verify else None
         self._holds = bool(self.assembly.held.any())
         self._silent = np.zeros(len(model.w))
 
@@ -337,32 +353,37 @@ class MHE:
                     "smooth(state, t) gives estimates of the past"
                 )
             t = state.t
-        start = t - self.horizon
-        growing = start <= state.t0 + self._slack(t)
-        start = state.t0 if growing else start
-        again = t == state.t  # the solve at this instant, repeated with what has arrived since
-        since = state.since if again else state.t
+        since = state.since if t == state.t else state.t  # a solve repeated with what has arrived takes its own place
         if self._updates is not None:
             logs = (state.measurements, state.inputs, state.path)
             known, times = (state.start, state.p), (state.t, since)
-            update = self._updates.run((start, t), growing, *logs, state.window, known, times)
+            update = self._updates.run(*self._span(state, t), *logs, state.window, known, times)
             if update is not None:
                 notes = () if update.measured else ("no measurement in window",)
+                found = update.outcome
                 reached = (update.iterations, update.optimality, update.feasibility)
-                status = Status(Outcome.SOLVED, True, *reached, notes=notes)
+                status = Status(found, found is Outcome.SOLVED, *reached, 0.0, (), notes, update.factorizations)
                 added = (update.path_times, update.path_rows)
                 return self._conclude(state, t, since, update.solved, added, update.cost, status, began)
-        window, notes = self._window(state, start, t, growing)
+        window, notes = self._window(state, t)
         guesses = starting_points(self.stage, state, window)
-        solution, status = climb(window, self._solver, lambda: self._reference, guesses, notes)
+        rungs = (window, self._solver, lambda: self._reference, guesses, notes)
+        solution, status = climb(*rungs, real_time=self._real_time)
         if solution is None:
             solution = open_loop(self.stage, state, window)
         solved = self._packed(window, solution)
         added = path_rows(solved.trajectory, since)
         return self._conclude(state, t, since, solved, added, solution.cost, status, began)
 
-    def _window(self, state: State, start: float, end: float, growing: bool) -> tuple[Window, tuple[str, ...]]:
-        """Return the problem over [start, end], and what there is to note about it."""
+    def _span(self, state: State, end: float) -> tuple[tuple[float, float], bool]:
+        """Return start and end of the window that ends at `end`, and whether it still grows."""
+        start = end - self.horizon
+        growing = start <= state.t0 + self._slack(end)
+        return (state.t0 if growing else start, end), growing
+
+    def _window(self, state: State, end: float) -> tuple[Window, tuple[str, ...]]:
+        """Return the problem of the window that ends at `end`, and what there is to note about it."""
+        (start, _), growing = self._span(state, end)
         prior, factor, notes = self._prior(state, start, growing)
         records = self._records(state, end, start)
         window = self.assembly.window(start, end, records, prior, growing=growing, prior_factor=factor)
@@ -422,6 +443,8 @@ class MHE:
         began: float,
     ) -> tuple[State, Estimate]:
         """Return the next state and the estimate of a solved window; `added` is what it adds to the path."""
+        if self._check is not None and status.success:
+            check(self._window(state, t)[0], solved, cost, self._check)
         x, p, w, y = solved.last()
         if self.model.step is not None:
             u = solved.part("u1")[-1]
@@ -447,8 +470,7 @@ class MHE:
         )
 
         def covariance() -> tuple[Array, int]:
-            start = max(edge, state.t0)
-            window, _ = self._window(state, start, t, growing=edge <= state.t0 + self._slack(t))
+            window, _ = self._window(state, t)
             values, rank = self._gauss_newton.covariance(window, solved.guess)
             return frozen(values), rank
 

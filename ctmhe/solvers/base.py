@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from ctmhe.transcription.problem import Guess, Window
-from ctmhe.types import Array
+from ctmhe.types import Array, Outcome
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +35,8 @@ class Solution:
     factorizations : int
     multipliers : Multipliers or None
         Of the dynamics and the bounds, in scaled variables, for the cost J / 2.
+    stopped : Outcome or None
+        The limit (of iterations, of time) that ended a solve which was still making progress.
     """
 
     point: Guess
@@ -47,6 +49,7 @@ class Solution:
     feasibility: float = float("nan")
     factorizations: int = 0
     multipliers: Multipliers | None = None
+    stopped: Outcome | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,12 +14,13 @@ import numpy as np
 from ctmhe.errors import SolverError
 from ctmhe.transcription.stage import StageFunction
 
-VERSION = 2
+VERSION = 3
 MAX_ARGUMENTS = 64
-CONVERGED, ITERATION_LIMIT, NOT_FINITE, NO_DECREASE, SINGULAR = range(5)
+CONVERGED, ITERATION_LIMIT, NOT_FINITE, NO_DECREASE, SINGULAR, DEADLINE = range(6)
 STAGE_FUNCTIONS = ("ctmhe_stage_value", "ctmhe_stage_jacobian", "ctmhe_stage_curvature")
 
 _pointer, _int, _double = ctypes.c_void_p, ctypes.c_int, ctypes.c_double
+clock_type = ctypes.CFUNCTYPE(_double)
 _eval_type = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 _get_pointer = ctypes.pythonapi.PyCapsule_GetPointer
 _get_pointer.restype, _get_pointer.argtypes = ctypes.c_void_p, [ctypes.py_object, ctypes.c_char_p]
@@ -65,7 +66,10 @@ class WindowHeader(ctypes.Structure):
 class Options(ctypes.Structure):
     """What the solver is told."""
 
-    _fields_ = [("max_iterations", _int), ("tolerance", _double), ("accuracy", _double)]
+    _fields_ = [
+        *(("max_iterations", _int), ("tolerance", _double), ("accuracy", _double)),
+        *(("seconds", _double), ("clock", _pointer)),
+    ]
 
 
 class ResultHeader(ctypes.Structure):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ctypes
 import logging
+import time
+from collections.abc import Callable
 from pathlib import Path
 from threading import local
 from typing import Any
@@ -14,6 +16,7 @@ from ctmhe.errors import SolverError
 from ctmhe.solvers.base import Multipliers, Solution, clip_to_bounds
 from ctmhe.solvers.binding import (
     CONVERGED,
+    DEADLINE,
     ITERATION_LIMIT,
     NO_DECREASE,
     NOT_FINITE,
@@ -24,14 +27,17 @@ from ctmhe.solvers.binding import (
     ResultHeader,
     WindowHeader,
     check_sizes,
+    clock_type,
     load,
 )
 from ctmhe.solvers.codegen import shipped_core, specialised_core
 from ctmhe.transcription.problem import Guess, Window
 from ctmhe.transcription.stage import StageFunction
-from ctmhe.types import Array
+from ctmhe.types import Array, Outcome
 
 logger = logging.getLogger(__name__)
+
+STOPPED = {ITERATION_LIMIT: Outcome.ITERATION_LIMIT, DEADLINE: Outcome.DEADLINE}
 
 _GUESSED = ("x", "w", "p", "x_active", "w_active", "y_active", "p_active")
 
@@ -47,6 +53,8 @@ class CompiledGaussNewton:
         exports as `ctmhe_stage_value`, `ctmhe_stage_jacobian` and `ctmhe_stage_curvature`; the ones it lacks are
         evaluated by CasADi.
     max_iterations : int
+    deadline : float, optional
+        Seconds by `clock` after which no further iteration begins.
     tolerance : float
         Relative predicted decrease of the cost at which a full step is the last.
 
@@ -58,15 +66,31 @@ class CompiledGaussNewton:
 
     name = "compiled Gauss-Newton"
 
-    def __init__(self, stage: StageFunction, library: Path, *, max_iterations: int = 50, tolerance: float = 1e-11):
+    def __init__(
+        self,
+        stage: StageFunction,
+        library: Path,
+        *,
+        max_iterations: int = 50,
+        deadline: float | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+        tolerance: float = 1e-11,
+    ):
         self.stage, self.library = stage, Path(library)
-        self.max_iterations, self.tolerance = max_iterations, tolerance
+        self.max_iterations, self.deadline, self.clock, self.tolerance = max_iterations, deadline, clock, tolerance
+        self._clock = clock_type(clock)
         self.core = load(self.library)
         check_sizes(self.core, stage, self.library)
         self._local = local()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _rebuild, (self.stage, self.library, self.max_iterations, self.tolerance)
+        options = {key: getattr(self, key) for key in ("max_iterations", "deadline", "clock", "tolerance")}
+        return _rebuild, (self.stage, self.library, options)
+
+    def options(self) -> Options:
+        """Return what the core is told."""
+        clock = ctypes.cast(self._clock, ctypes.c_void_p)
+        return Options(self.max_iterations, self.tolerance, self.stage.accuracy, self.deadline or 0.0, clock)
 
     def solve(self, window: Window, guess: Guess) -> Solution:
         """Return the solution from `guess`; never raises for numerical trouble."""
@@ -74,11 +98,8 @@ class CompiledGaussNewton:
         n = len(window.mesh.h)
         if memory is None or memory.capacity < n:
             capacity = max(32, n if memory is None else n + n // 2)
-            memory = self._local.memory = _Memory(self.core, self.stage, capacity)
+            memory = self._local.memory = _Memory(self.core, self.stage, self.options(), capacity)
         memory.write(window, guess, n)
-        options = memory.options
-        options.max_iterations, options.tolerance = self.max_iterations, self.tolerance
-        options.accuracy = self.stage.accuracy
         stop = self.core.ctmhe_solve(*memory.pointers)
         result = memory.result
         if stop == NOT_FINITE:
@@ -97,6 +118,7 @@ class CompiledGaussNewton:
             result.feasibility,
             result.factorizations,
             Multipliers(*multipliers),
+            STOPPED.get(stop),
         )
 
     def _message(self, stop: int) -> str:
@@ -104,18 +126,19 @@ class CompiledGaussNewton:
             CONVERGED: "converged",
             ITERATION_LIMIT: f"no convergence in {self.max_iterations} iterations",
             NO_DECREASE: "no step decreases the merit function",
+            DEADLINE: f"no convergence in {self.deadline} s",
             SINGULAR: "no consistent set of active bounds, or a direction without curvature",
         }[stop]
 
 
-def compiled_solver(stage: StageFunction, *, specialise: bool, max_iterations: int) -> CompiledGaussNewton | None:
+def compiled_solver(stage: StageFunction, *, specialise: bool, **limits: Any) -> CompiledGaussNewton | None:
     """Return the solver in the core, if wished compiled for `stage`; None, with the reason logged, without any."""
     library = (specialised_core(stage) if specialise else None) or shipped_core()
     if library is None:
         logger.info("no compiled core: neither a built one nor a C compiler was found")
         return None
     try:
-        return CompiledGaussNewton(stage, library, max_iterations=max_iterations)
+        return CompiledGaussNewton(stage, library, **limits)
     except (OSError, SolverError) as error:
         logger.warning("the compiled core %s cannot be used: %s", library, error)
         return None
@@ -124,7 +147,7 @@ def compiled_solver(stage: StageFunction, *, specialise: bool, max_iterations: i
 class _Memory:
     """Arrays of one thread for windows of up to `capacity` slots, bound once to the core's structures."""
 
-    def __init__(self, core: ctypes.CDLL, stage: StageFunction, capacity: int):
+    def __init__(self, core: ctypes.CDLL, stage: StageFunction, options: Options, capacity: int):
         self.stage, self.capacity = stage, capacity
         nx, nw, n_p, nu, ny, q, n = stage.nx, stage.nw, stage.np, stage.nu, stage.ny, stage.q, capacity
         width = nx + n_p
@@ -139,7 +162,7 @@ class _Memory:
         self.window = WindowHeader(**{key: array.ctypes.data for key, array in self.inputs.items()})
         self.result = ResultHeader()
         self._lay_out(capacity)
-        self.options = Options()
+        self.options = options
         self.functions = Functions(core, stage)
         structure = self.functions.structure
         self.scratch = np.empty(core.ctmhe_scratch_size(ctypes.addressof(structure), n) // 8 + 8)
@@ -206,5 +229,5 @@ class _Memory:
         return self._view([block.copy() for block in self._blocks])
 
 
-def _rebuild(stage: StageFunction, library: Path, max_iterations: int, tolerance: float) -> CompiledGaussNewton:
-    return CompiledGaussNewton(stage, library, max_iterations=max_iterations, tolerance=tolerance)
+def _rebuild(stage: StageFunction, library: Path, options: dict[str, Any]) -> CompiledGaussNewton:
+    return CompiledGaussNewton(stage, library, **options)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from threading import local
@@ -14,7 +15,7 @@ from ctmhe.solvers.base import Multipliers, Solution, clip_to_bounds
 from ctmhe.solvers.quadratic import KKT, ActiveSet, QuadraticProgram, Singular, Step
 from ctmhe.transcription.problem import Guess, Window, bound_violation, cost_of, prior_deviation
 from ctmhe.transcription.stage import Linearization, StageFunction
-from ctmhe.types import Array
+from ctmhe.types import Array, Outcome
 
 ARMIJO = 1e-4
 DAMPING_START, DAMPING_LIMIT = 1e-8, 1e8
@@ -52,14 +53,25 @@ class GaussNewton:
     ----------
     stage : StageFunction
     max_iterations : int
+    deadline : float, optional
+        Seconds by `clock` after which no further iteration begins.
     tolerance : float
         Relative predicted decrease of the cost at which a full step is the last.
     """
 
     name = "Gauss-Newton"
 
-    def __init__(self, stage: StageFunction, *, max_iterations: int = 50, tolerance: float = 1e-11):
+    def __init__(
+        self,
+        stage: StageFunction,
+        *,
+        max_iterations: int = 50,
+        deadline: float | None = None,
+        clock: Callable[[], float] = time.perf_counter,
+        tolerance: float = 1e-11,
+    ):
         self.stage, self.max_iterations, self.tolerance = stage, max_iterations, tolerance
+        self.deadline, self.clock = deadline, clock
         self._scratch = local()  # one set of KKT systems a thread
 
     def solve(self, window: Window, guess: Guess) -> Solution:
@@ -85,8 +97,11 @@ class GaussNewton:
             return self._failed(window, guess, "the model is not finite at the guess")
         recent = deque([(current.cost, current.infeasibility)], maxlen=MEMORY)
         message, success = f"no convergence in {self.max_iterations} iterations", False
-        iteration = 0
+        iteration, stopped, began = 0, None, self.clock()
         while iteration < self.max_iterations:
+            if iteration and self.deadline is not None and self.clock() - began >= self.deadline:
+                message, stopped = f"no convergence in {self.deadline} s", Outcome.DEADLINE
+                break
             iteration += 1
             qp = self._quadratic_program(window, current, kkt, step if newton else None)
             try:
@@ -132,6 +147,8 @@ class GaussNewton:
             if small and light and self._feasible(current):
                 message, success = "converged", True
                 break
+        else:
+            stopped = Outcome.ITERATION_LIMIT
         point = current.point
         feasibility = max(
             float(np.abs(current.defect).max(initial=0.0)), bound_violation(window, point, self._y_end(current))
@@ -154,6 +171,7 @@ class GaussNewton:
             feasibility,
             factorizations,
             multipliers,
+            stopped,
         )
 
     def _system(self, window: Window) -> KKT:

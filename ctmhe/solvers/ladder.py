@@ -21,6 +21,8 @@ def climb(
     reference: Callable[[], Solver],
     guesses: Sequence[tuple[str, Callable[[], Guess]]],
     notes: tuple[str, ...],
+    *,
+    real_time: bool = False,
 ) -> tuple[Solution | None, Status]:
     """Try each rung until one succeeds.
 
@@ -35,6 +37,8 @@ def climb(
         Warm start first, then the shifted guess (the prior carried forward); made when their turn comes.
     notes : tuple of str
         Facts about the window for the status.
+    real_time : bool
+        The solver's iterate at its limit is what is wanted: the first rung that gives finite numbers is the last.
 
     Returns
     -------
@@ -56,7 +60,11 @@ def climb(
         solution = run(name, solver, window, make())
         if solution.success:
             return solution, _status(Outcome.SOLVED, solution, rungs, notes)
+        if real_time and solution.stopped is not None:
+            return solution, _status(solution.stopped, solution, (), notes)
         attempts.append(solution)
+    if real_time:
+        return None, Status(Outcome.PREDICTED, False, rungs=tuple(rungs), notes=notes)
     guess = guesses[-1][1]()
     usable = [a for a in attempts if np.isfinite(a.cost)]
     start = min(usable, key=lambda a: a.feasibility + a.cost * 1e-12).point if usable else guess
@@ -90,4 +98,5 @@ def _status(outcome: Outcome, solution: Solution, rungs: Sequence[str], notes: t
         0.0,
         tuple(rungs),
         notes,
+        solution.factorizations,
     )

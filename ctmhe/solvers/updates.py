@@ -15,17 +15,16 @@ from ctmhe.solvers.binding import (
     CONVERGED,
     EstimatorHeader,
     Functions,
-    Options,
     RequestHeader,
     ResultHeader,
     WindowHeader,
 )
-from ctmhe.solvers.compiled import CompiledGaussNewton
+from ctmhe.solvers.compiled import STOPPED, CompiledGaussNewton
 from ctmhe.transcription.assembly import Assembly
 from ctmhe.transcription.grid import Mesh, same_time
 from ctmhe.transcription.problem import Guess, Window
 from ctmhe.transcription.solved import Layout, Solved
-from ctmhe.types import Array
+from ctmhe.types import Array, Outcome
 
 ELSEWHERE, TOO_SMALL = -1, -2
 SMALLEST = 64  # slots for which there is room at least
@@ -33,19 +32,22 @@ SMALLEST = 64  # slots for which there is room at least
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Update:
-    """What one converged update gave.
+    """What one update gave.
 
     Attributes
     ----------
+    outcome : Outcome
+        Solved, or stopped at a limit.
     solved : Solved
     path_times, path_rows : array (m,), (m, width)
         What the solution adds to the estimated trajectory; valid until the next update in this thread.
     cost, optimality, feasibility : float
-    iterations : int
+    iterations, factorizations : int
     measured : bool
         There is a measurement in the window.
     """
 
+    outcome: Outcome
     solved: Solved
     path_times: Array
     path_rows: Array
@@ -53,6 +55,7 @@ class Update:
     optimality: float
     feasibility: float
     iterations: int
+    factorizations: int
     measured: bool
 
 
@@ -63,8 +66,9 @@ class CompiledUpdates:
     than the horizon), and solves that do not converge, are left to them.
     """
 
-    def __init__(self, solver: CompiledGaussNewton, assembly: Assembly, layout: Layout):
+    def __init__(self, solver: CompiledGaussNewton, assembly: Assembly, layout: Layout, *, real_time: bool = False):
         self.solver, self.assembly, self.layout = solver, assembly, layout
+        self._outcomes = {CONVERGED: Outcome.SOLVED} | (STOPPED if real_time else {})
         self._local = local()
 
     @staticmethod
@@ -114,7 +118,8 @@ class CompiledUpdates:
         while stop == TOO_SMALL:
             memory = self._memory(memory.request.n)
             stop = memory.call(memory.update, span, growing, measurements, inputs, path, last, known, times)
-        return memory.found() if stop == CONVERGED else None
+        outcome = self._outcomes.get(stop)
+        return None if outcome is None else memory.found(outcome)
 
     def assembled(self, *arguments: Any) -> tuple[Window, Guess] | None:
         """Return copies of the window and the guess that `run` would solve from; None where it would return None."""
@@ -133,7 +138,7 @@ class _Memory:
         self.functions = Functions(core, self.stage)
         self.estimator, self._kept = _estimator(assembly)
         self.request, self.window, self.result = RequestHeader(capacity=capacity), WindowHeader(), ResultHeader()
-        self.options = Options(solver.max_iterations, solver.tolerance, self.stage.accuracy)
+        self.options = solver.options()
         stage = self.functions.structure
         self.scratch = np.empty(core.ctmhe_update_size(ctypes.addressof(stage), capacity) // 8 + 8)
         aligned = -(-self.scratch.ctypes.data // 64) * 64
@@ -195,13 +200,14 @@ class _Memory:
             request.last, request.last_active, request.last_n = last.addresses
         return function()
 
-    def found(self) -> Update:
+    def found(self, outcome: Outcome) -> Update:
         """Copy the results out."""
         request, result = self.request, self.result
         n, added = request.n, request.path_added
         parts = self.layout.parts(n)
         values, active = self.values[parts["values"][0]].copy(), self.active[parts["active"][0]].copy()
         return Update(
+            outcome,
             Solved.closed(self.layout, n, values, active),
             self.path_times[:added],
             self.path_rows[:added],
@@ -209,6 +215,7 @@ class _Memory:
             result.optimality,
             result.feasibility,
             result.iterations,
+            result.factorizations,
             bool(request.measured),
         )
 

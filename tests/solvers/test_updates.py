@@ -85,18 +85,15 @@ def estimator(name: str) -> MHE:
 
 def request(mhe: MHE, state, t: float):
     """What `estimate` would ask the core for."""
-    start = t - mhe.horizon
-    growing = start <= state.t0 + mhe._slack(t)
-    start = state.t0 if growing else start
     logs = (state.measurements, state.inputs, state.path)
-    found = mhe._updates.assembled((start, t), growing, *logs, state.window, (state.start, state.p), (state.t, state.t))
-    return start, growing, found
+    known, times = (state.start, state.p), (state.t, state.t)
+    return mhe._updates.assembled(*mhe._span(state, t), *logs, state.window, known, times)
 
 
 def compare(mhe: MHE, state, t: float) -> None:
     """Window and guess from the core against those from Python."""
-    start, growing, found = request(mhe, state, t)
-    window, notes = mhe._window(state, start, t, growing)
+    found = request(mhe, state, t)
+    window, notes = mhe._window(state, t)
     if found is None:
         patterns = np.isfinite(state.measurements.arrays()[1])
         correlated = np.ndim(mhe.cost.R) == 2 and (patterns.any(axis=1) & ~patterns.all(axis=1)).any()
@@ -110,7 +107,7 @@ def compare(mhe: MHE, state, t: float) -> None:
         if field.name not in ("mesh", "p_estimated"):
             mine, other = getattr(ours, field.name), getattr(window, field.name)
             np.testing.assert_allclose(mine, other, rtol=1e-12, atol=1e-14, err_msg=field.name)
-    warm = state.window is not None and state.t >= start
+    warm = state.window is not None and state.t >= window.mesh.t[0]
     other = warm_start(mhe.stage, state, window) if warm else shifted_guess(mhe.stage, window)
     for key, value in vars(other).items():
         np.testing.assert_allclose(getattr(guess, key), value, rtol=1e-10, atol=1e-12, err_msg=key)

@@ -345,7 +345,13 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
   recent_infeasibility[0] = current->infeasibility;
   double rho = 0.0, last_decrease = NAN;
   int newton = 0, with_curvature = 0, stepped = 0, stop = CTMHE_ITERATION_LIMIT, iteration = 0;
+  const int limited = options->seconds > 0.0 && options->clock;
+  const double began = limited ? options->clock() : 0.0;
   while (iteration < options->max_iterations) {
+    if (limited && iteration && options->clock() - began >= options->seconds) {
+      stop = CTMHE_DEADLINE;
+      break;
+    }
     iteration++;
     if (k->bounded) {
       relative_bounds(k, current);
@@ -473,6 +479,7 @@ int ctmhe_update(const ctmhe_stage *stage, const ctmhe_estimator *estimator, ctm
   const int outcome = assemble(&a, stage, estimator, request, window, result, scratch);
   if (outcome) return outcome;
   const int stop = ctmhe_solve(stage, window, options, result, a.solve);
-  if (stop == CTMHE_CONVERGED) write_path(&a, window, result, request);
+  if (stop == CTMHE_CONVERGED || stop == CTMHE_ITERATION_LIMIT || stop == CTMHE_DEADLINE)
+    write_path(&a, window, result, request);
   return stop;
 }

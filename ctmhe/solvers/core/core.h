@@ -17,7 +17,7 @@
 extern "C" {
 #endif
 
-#define CTMHE_CORE_VERSION 2
+#define CTMHE_CORE_VERSION 3
 #define CTMHE_MAX_ARGUMENTS 64 /* pointers a compiled stage function may use (CasADi's sz_arg, sz_res) */
 
 /* The stage function over one slot, in CasADi's own calling convention:
@@ -69,6 +69,8 @@ typedef struct {
   int max_iterations;
   double tolerance;           /* predicted decrease relative to the cost at which a full step is the last */
   double accuracy;            /* of an evaluation, relative: round-off, or the tolerance of an adaptive integrator */
+  double seconds;             /* after which no further iteration begins; <= 0: no limit */
+  double (*clock)(void);      /* seconds; needed with a limit */
 } ctmhe_options;
 
 enum ctmhe_stop {             /* why the core stopped */
@@ -76,7 +78,8 @@ enum ctmhe_stop {             /* why the core stopped */
   CTMHE_ITERATION_LIMIT = 1,
   CTMHE_NOT_FINITE = 2,       /* the model is not finite at the guess, or failed there */
   CTMHE_NO_DECREASE = 3,      /* no step decreases the merit function */
-  CTMHE_SINGULAR = 4          /* no consistent set of active bounds, or a direction without curvature */
+  CTMHE_SINGULAR = 4,         /* no consistent set of active bounds, or a direction without curvature */
+  CTMHE_DEADLINE = 5
 };
 
 typedef struct {              /* in and out */
