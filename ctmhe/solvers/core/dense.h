@@ -2,7 +2,7 @@
 #ifndef CTMHE_DENSE_H
 #define CTMHE_DENSE_H
 
-#include "layout.h"
+#include "wide.h"
 
 /* M += S'S over the upper triangle, columns from..n of the first `count` rows of S. */
 INLINE void add_square(double *restrict M, const double *restrict S, int count, int from, int n) {
@@ -52,6 +52,7 @@ INLINE void transform(double *restrict S, const double *restrict U, const double
 
 /* M = U'U in place, with reciprocal pivots D; `floor` holds the pivots that count as zero; `skip` rows are zero. */
 INLINE int cholesky(double *restrict M, double *restrict D, const double *restrict floor, const uint8_t *skip, int n) {
+  if (WIDE(n)) return wide_eliminate(M, D, floor, skip, n, n, 0);
   int status = OK;
   for (int block = 0; block < n; block += TILE) {
     const int end = block + TILE < n ? block + TILE : n;
@@ -112,7 +113,11 @@ INLINE void add_plain(double *restrict M, const double *restrict P, const double
 /* Cholesky rows for the first `count` variables; what remains is their Schur complement, both triangles. */
 INLINE int eliminate_plain(double *restrict M, double *restrict D, const double *restrict floor,
                            const uint8_t *restrict skip, int count, int n) {
-  for (int j = 0; j < count; j++) {
+  if (WIDE(n)) {
+    const int status = wide_eliminate(M, D, floor, skip, count, n, 1);
+    if (status) return status;
+  }
+  for (int j = 0; j < count && !WIDE(n); j++) {
     double *restrict row = M + j * n;
     const double pivot = row[j];
     if (pivot != pivot) return NOT_A_NUMBER;

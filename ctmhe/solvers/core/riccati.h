@@ -80,8 +80,10 @@ INLINE int backward_sized(core *k, const model *m, int from, int right_hand_side
     else {
       const double *g = m->g + (size_t)(slot * n), *H = m->H + (size_t)slot * nn;
       for (int i = 0; i < n; i++) q[i] = g[i];
-      for (size_t i = 0; i < nn; i++) U[i] = H[i];
-      if (k->plain) {
+      for (size_t i = 0; i < nn && !WIDE(n); i++) U[i] = H[i];
+      if (WIDE(n)) {
+        wide_add(U, H, behind, J, k->S, !k->plain, o, nx, nw, np);
+      } else if (k->plain) {
         add_plain(U, behind, J, k->S, o, nx, nw, np);
       } else {
         transform(k->S, behind, J, o, nx, nw, np);
