@@ -74,7 +74,7 @@ class CompiledGaussNewton:
         max_iterations: int = 50,
         deadline: float | None = None,
         clock: Callable[[], float] = time.perf_counter,
-        tolerance: float = 1e-11,
+        tolerance: float = 1e-9,
     ):
         self.stage, self.library = stage, Path(library)
         self.max_iterations, self.deadline, self.clock, self.tolerance = max_iterations, deadline, clock, tolerance

@@ -208,9 +208,17 @@ static void move(const core *k, const model *from, model *to, double alpha) {
                      : from->p[i];
 }
 
-/* The predicted decrease that is small enough to stop: relative to the cost, or below round-off. */
+/* The remaining decrease that is small enough to stop: relative to the cost, or below round-off. */
 static double enough(const ctmhe_options *options, double cost, double data) {
   return options->tolerance * cost + ROUND_OFF * sqrt(cost * data) + options->accuracy * options->accuracy * data;
+}
+
+/* How far the quadratic model was off along a full step, relative to its own curvature there: to first order what the
+ * next Gauss-Newton step is against this one. */
+static double contraction(const core *k, const model *from, const model *to) {
+  double error = to->cost / 2 - from->cost / 2 + k->decrease;
+  for (size_t i = 0; i < (size_t)k->N * (size_t)NX(k->s); i++) error += k->lambda[i] * to->c[i];
+  return k->curvature > 0.0 ? 2.0 * fabs(error) / k->curvature : 1.0;
 }
 
 /* The largest component of the step, relative to the signals' scales. */
@@ -343,7 +351,7 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
   int remembered = 1, newest = 0;
   recent_cost[0] = current->cost;
   recent_infeasibility[0] = current->infeasibility;
-  double rho = 0.0, last_decrease = NAN;
+  double rho = 0.0, last_decrease = NAN, last_gain = 0.0;
   int newton = 0, with_curvature = 0, stepped = 0, stop = CTMHE_ITERATION_LIMIT, iteration = 0;
   const int limited = options->seconds > 0.0 && options->clock;
   const double began = limited ? options->clock() : 0.0;
@@ -362,12 +370,12 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
       if (add_curvature(k, current)) status = NOT_A_NUMBER;
       with_curvature = 1;
     }
-    k->plain = with_curvature;
+    k->plain = 1;
     if (status == OK) status = solve_program(k, current, &result->factorizations);
     if (status == OK && k->stationarity > 1e-6) status = INCONSISTENT; /* a gradient where there is no curvature */
     if (status != OK && with_curvature) {
       newton = with_curvature = 0;
-      last_decrease = NAN;
+      last_decrease = NAN, last_gain = 0.0;
       if (linearize(k, current)) return result->stop;
       continue;
     }
@@ -388,6 +396,8 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
     stepped = 1;
     result->optimality = k->optimality;
     const double predicted = k->decrease, force = 1.5 * largest_force(k);
+    const double gain = fabs(predicted) > k->curvature / 2 ? fabs(predicted) : k->curvature / 2;
+    const double rate = gain < last_gain ? gain / last_gain : 1.0; /* at which the gains shrink */
     if (force > rho || iteration <= SETTLED) rho = force;
     if (k->damping == 0.0 && current->defect <= feasible && current->excess <= feasible &&
         largest_step(k) <= 100 * accuracy) { /* the step is below what the integrator can tell apart */
@@ -395,7 +405,7 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
       break;
     }
     /* a full step is likely the last: it needs no new linearisation */
-    const int last = fabs(predicted) <= enough(options, current->cost, data);
+    const int last = rate * gain <= enough(options, current->cost, data);
     double merit = -HUGE_VAL; /* the worst of the last few: curved dynamics would cut good full steps */
     for (int i = 0; i < remembered; i++) {
       const double past = recent_cost[i] / 2 + rho * recent_infeasibility[i];
@@ -421,7 +431,7 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
     }
     if (!accepted && with_curvature) {
       newton = with_curvature = 0;
-      last_decrease = NAN;
+      last_decrease = NAN, last_gain = 0.0;
       if (linearize(k, current)) return result->stop;
       continue;
     }
@@ -447,10 +457,13 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
     if (remembered < MEMORY) remembered++;
     recent_cost[newest] = current->cost;
     recent_infeasibility[newest] = current->infeasibility;
-    if (fabs(predicted) <= enough(options, current->cost, data) && alpha == 1.0 && light &&
-        current->defect <= feasible && current->excess <= feasible) {
-      stop = CTMHE_CONVERGED;
-      break;
+    last_gain = alpha == 1.0 && light ? gain : 0.0;
+    if (alpha == 1.0 && light && current->defect <= feasible && current->excess <= feasible) {
+      const double off = contraction(k, trial, current);
+      if (gain * (off * off > rate ? off * off : rate) <= enough(options, current->cost, data)) {
+        stop = CTMHE_CONVERGED;
+        break;
+      }
     }
     if (!linearized && linearize(k, current)) return result->stop;
   }

@@ -67,7 +67,7 @@ typedef struct {
 
 typedef struct {
   int max_iterations;
-  double tolerance;           /* predicted decrease relative to the cost at which a full step is the last */
+  double tolerance;           /* of the cost, relative: what a further step would still gain */
   double accuracy;            /* of an evaluation, relative: round-off, or the tolerance of an adaptive integrator */
   double seconds;             /* after which no further iteration begins; <= 0: no limit */
   double (*clock)(void);      /* seconds; needed with a limit */

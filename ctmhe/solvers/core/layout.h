@@ -84,7 +84,7 @@ typedef struct {
   model a, b;
   int plain;               /* with second derivatives: keep P = U'U itself, which may be indefinite */
   double stiffness, damping;
-  double decrease, optimality, stationarity; /* of the last step */
+  double decrease, curvature, optimality, stationarity; /* of the last step */
 } core;
 
 typedef struct {

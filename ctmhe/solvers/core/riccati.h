@@ -341,6 +341,7 @@ INLINE void adjoint_sized(core *k, const model *m, int nx, int nw, int np) {
   }
   if (force > largest) largest = force;
   k->decrease = -(slope + curvature / 2);
+  k->curvature = curvature;
   k->optimality = product / (largest > 1e-300 ? largest : 1e-300);
   if (product > largest) largest = product;
   k->stationarity = residual / (largest > 1e-300 ? largest : 1e-300);
