@@ -15,8 +15,7 @@ INLINE void pull_back(double *restrict m, const double *restrict U, const double
       for (int l = 0; l < nx; l++) y[i] += U[i * n + nw + l] * c[l];
   } else if (c)
     for (int j = o; j < nw + nx; j++) {
-      double t = 0.0;
-      for (int i = j < nw ? 0 : j - nw; i < nx; i++) t += U[j * n + nw + i] * c[i];
+      const double t = dot(0.0, U + j * n + nw, c, j < nw ? 0 : j - nw, nx, n);
       for (int i = j; i < n; i++) y[i] += U[j * n + i] * t;
     }
   for (int i = 0; i < nx; i++) {
@@ -192,9 +191,7 @@ static int backward(core *k, const model *m, int from, int right_hand_side) {
 INLINE void back_substitute(double *restrict v, const double *restrict U, const double *restrict D,
                             const double *restrict l, int count, int n) {
   for (int j = count - 1; j >= 0; j--) {
-    double t = l[j];
-    for (int i = j + 1; i < n; i++) t += U[j * n + i] * v[i];
-    v[j] = -t * D[j];
+    v[j] = -dot(l[j], U + j * n, v, j + 1, n, n) * D[j];
   }
 }
 
@@ -229,16 +226,11 @@ INLINE void forward_sized(core *k, const model *m, int correction, int nx, int n
         for (int i = 0; i < np; i++) d[k->fp + (size_t)i] = v[nw + nx + i];
     }
     for (int i = 0; i < nb; i++) {
-      double t = 0.0;
-      for (int l = 0; l < n; l++) t += J[(nx + i) * n + l] * v[l];
+      const double t = dot(0.0, J + (nx + i) * n, v, 0, n, n);
       if (correction) dy[i] += t;
       else dy[i] = t;
     }
-    for (int i = 0; i < nx; i++) {
-      double t = correction ? 0.0 : c[i];
-      for (int l = 0; l < n; l++) t += J[i * n + l] * v[l];
-      next[i] = t;
-    }
+    for (int i = 0; i < nx; i++) next[i] = dot(correction ? 0.0 : c[i], J + i * n, v, 0, n, n);
     for (int i = 0; i < nx; i++) v[nw + i] = next[i];
   }
   for (int i = 0; i < nx; i++) {
@@ -280,12 +272,8 @@ INLINE void adjoint_sized(core *k, const model *m, int nx, int nw, int np) {
     for (int i = 0; i < n; i++) Hv[i] = 0.0;
     for (int i = 0; i < n; i++) {
       const double vi = v[i], *restrict row = H + i * n;
-      double t = row[i] * vi;
-      for (int j = i + 1; j < n; j++) {
-        t += row[j] * v[j];
-        Hv[j] += row[j] * vi;
-      }
-      Hv[i] += t;
+      Hv[i] += dot(row[i] * vi, row, v, i + 1, n, n);
+      for (int j = i + 1; j < n; j++) Hv[j] += row[j] * vi;
     }
     for (int i = 0; i < n; i++) {
       slope += g[i] * v[i];

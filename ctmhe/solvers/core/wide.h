@@ -8,6 +8,21 @@
 
 #include "layout.h"
 
+/* Start + the sum of a_i b_i, from..to-1, in the order of i; for slots of n >= WIDE_FROM variables in four sums, which
+ * do not wait for each other. */
+INLINE double dot(double start, const double *a, const double *b, int from, int to, int n) {
+  double more = 0.0, third = 0.0, fourth = 0.0;
+  int i = from;
+  for (; n >= WIDE_FROM && i + 4 <= to; i += 4) {
+    start += a[i] * b[i];
+    more += a[i + 1] * b[i + 1];
+    third += a[i + 2] * b[i + 2];
+    fourth += a[i + 3] * b[i + 3];
+  }
+  for (; i < to; i++) start += a[i] * b[i];
+  return n < WIDE_FROM ? start : start + more + (third + fourth);
+}
+
 #if defined(__GNUC__) && !defined(CTMHE_NARROW) /* which stands for a compiler without vectors */
 #define WIDE(n) ((n) >= WIDE_FROM)
 
@@ -74,17 +89,20 @@ INLINE void mirror(double *M, int from, int n) {
 
 /* The rows of J that are not zero in columns 4 b .. 4 b + 3, as lists nx apart. */
 INLINE void list_rows(int *list, int *entries, const double *J, int nx, int n) {
-  const int whole = n / 4, blocks = (n + 3) / 4;
-  for (int b = 0; b < blocks; b++) entries[b] = 0;
-  for (int i = 0; i < nx; i++) {
-    const double *row = J + i * n;
-    for (int b = 0; b < whole; b++) {
+  const int whole = n / 4;
+  for (int b = 0; b < whole; b++) {
+    int count = 0;
+    for (int i = 0; i < nx; i++) {
       uint64_t word[4];
-      memcpy(word, row + 4 * b, sizeof word);
-      list[b * nx + entries[b]] = i;
-      entries[b] += (word[0] | word[1] | word[2] | word[3]) << 1 != 0; /* a shift drops the sign of a zero */
+      memcpy(word, J + i * n + 4 * b, sizeof word);
+      list[b * nx + count] = i;
+      count += (word[0] | word[1] | word[2] | word[3]) << 1 != 0; /* a shift drops the sign of a zero */
     }
-    if (whole < blocks) list[whole * nx + entries[whole]++] = i;
+    entries[b] = count;
+  }
+  if (4 * whole < n) {
+    for (int i = 0; i < nx; i++) list[whole * nx + i] = i;
+    entries[whole] = nx;
   }
 }
 
