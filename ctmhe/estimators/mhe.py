@@ -105,6 +105,9 @@ class MHE:
         `auto` compiles the model's functions together with the core, where a C compiler is found and they can be
         generated: once per model, in seconds, cached on disk. `off` evaluates them in CasADi's virtual machine. When
         left out, `$CTMHE_COMPILE`, else `auto`.
+    tolerance : float, optional
+        Of the cost, relative: what a further iteration would still gain (1e-9 when left out). The estimate is then off
+        by about the square root of this, in standard deviations.
     max_iterations : int, optional
         Real time: stop after so many iterations and take the iterate for the estimate, `Outcome.ITERATION_LIMIT`; 1 is
         the real-time iteration. When left out, iterate until converged, and where 50 are not enough ask others.
@@ -138,6 +141,7 @@ class MHE:
         longest_wait: float | None = None,
         solver: str = "gauss-newton",
         compile: str | None = None,
+        tolerance: float | None = None,
         max_iterations: int | None = None,
         deadline: float | None = None,
         verify: bool = False,
@@ -198,6 +202,8 @@ class MHE:
             filtering=filtering,
         )
         limits: dict[str, Any] = {"max_iterations": max_iterations or 50, "deadline": deadline, "clock": clock}
+        if tolerance is not None:
+            limits["tolerance"] = positive("tolerance", tolerance)
         self._gauss_newton = GaussNewton(self.stage, **limits)
         self._reference = Ipopt(self.stage)
         compile = compile or os.environ.get("CTMHE_COMPILE") or "auto"

@@ -14,7 +14,9 @@ from tests.conftest import REACTOR_COST, feed
 def solve(integrator, interval, hold="linear", end=1.2):
     """One window of the reactor with fixed smooth data."""
     model = batch_reactor()
-    mhe = MHE(model, horizon=2.0, interval=interval, integrator=integrator, cost=REACTOR_COST, hold=hold)
+    mhe = MHE(
+        model, horizon=2.0, interval=interval, integrator=integrator, cost=REACTOR_COST, hold=hold, tolerance=1e-15
+    )
     times = np.arange(0, 7) * 0.2
     rows = (4.0 - 0.9 * np.tanh(times))[:, None]
     _, estimate = mhe.estimate(feed(mhe, mhe.init(x=[2.5, 1.4]), times, rows), end)

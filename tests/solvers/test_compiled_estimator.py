@@ -34,7 +34,7 @@ def run(mhe, guess, p=None, count=40):
 @needs_compiler
 @pytest.mark.parametrize("case", ["bounded", "point, parameter", "CVODES", "FMU"])
 def test_a_run_in_the_compiled_core_equals_the_run_in_numpy(case):
-    """Costs to 1e-8 relative, estimates to 1e-5, for generated and for virtual-machine stage functions."""
+    """Costs to 1e-7 relative over a run, estimates to 1e-5, for generated and for virtual-machine stage functions."""
     joint = DiscountedCost(eta=0.5, P=np.diag([8.0, 7.1, 50.0]), Q=2e3, R=1e2)
     fixed = DiscountedCost(eta=0.5, P=[[8.0, 7.5], [7.5, 7.1]], Q=2e3, R=1e2)
     box = Bounds(x=(0.1, 5.0))
@@ -54,11 +54,11 @@ def test_a_run_in_the_compiled_core_equals_the_run_in_numpy(case):
     }[case]
     found = []
     for way in ({"solver": "numpy"}, {"compile": "off"}, {"compile": "auto"}):
-        mhe = MHE(model, horizon=1.0, interval=0.1, **way, **options)
+        mhe = MHE(model, horizon=1.0, interval=0.1, tolerance=1e-15, **way, **options)
         assert mhe._solver.name == ("Gauss-Newton" if "solver" in way else "compiled Gauss-Newton")
         found.append(run(mhe, [2.5, 1.4], p, count=40 if case != "CVODES" else 12))
     for other in found[1:]:
-        np.testing.assert_allclose(other[:, 0], found[0][:, 0], rtol=1e-6 if case == "CVODES" else 1e-8)
+        np.testing.assert_allclose(other[:, 0], found[0][:, 0], rtol=1e-6 if case == "CVODES" else 1e-7)
         np.testing.assert_allclose(other[:, 1:], found[0][:, 1:], atol=1e-5)
 
 

@@ -74,9 +74,13 @@ def case(name: str, rng) -> tuple[MHE, Window, Guess]:
 
 
 def agree(stage, library, window, guess, *, multipliers=True, reference=True):
-    """Solve with all; compare costs, points, active sets and multipliers."""
-    ours, python = CompiledGaussNewton(stage, library).solve(window, guess), GaussNewton(stage).solve(window, guess)
+    """Solve with all; compare costs at the default tolerance, and at a tight one active sets and multipliers too."""
+    python, usual = GaussNewton(stage).solve(window, guess), CompiledGaussNewton(stage, library).solve(window, guess)
+    ours = CompiledGaussNewton(stage, library, tolerance=1e-12).solve(window, guess)
     assert python.success, python.message
+    assert usual.success, usual.message
+    assert usual.cost == pytest.approx(python.cost, rel=1e-8, abs=1e-12)
+    assert usual.iterations <= ours.iterations
     assert ours.success, ours.message
     assert ours.feasibility < 1e-8
     assert ours.cost == pytest.approx(python.cost, rel=1e-8, abs=1e-12)
@@ -245,8 +249,9 @@ def test_random_quadratic_programs_match_ipopt(library, seed, n, boxes, p, share
     assert ours.success, ours.message
     assert bound_violation(window, ours.point, ours.y[:, -1]) < 1e-8
     assert ours.feasibility < 1e-8
-    if reference.success:
-        assert ours.cost == pytest.approx(reference.cost, rel=1e-7, abs=1e-7)
+    if reference.success:  # which loses digits where two bounds say the same; a feasible point that costs less is right
+        assert ours.cost <= reference.cost * (1 + 1e-7) + 1e-7
+        assert ours.cost == pytest.approx(reference.cost, rel=1e-5, abs=1e-7)
 
 
 @pytest.mark.parametrize("what", ["prior", "outputs", "outputs and prior", "disturbances", "all"])

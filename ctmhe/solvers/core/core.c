@@ -352,7 +352,7 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
   recent_cost[0] = current->cost;
   recent_infeasibility[0] = current->infeasibility;
   double rho = 0.0, last_decrease = NAN, last_gain = 0.0;
-  int newton = 0, with_curvature = 0, stepped = 0, stop = CTMHE_ITERATION_LIMIT, iteration = 0;
+  int rooted = 0, newton = 0, with_curvature = 0, stepped = 0, stop = CTMHE_ITERATION_LIMIT, iteration = 0;
   const int limited = options->seconds > 0.0 && options->clock;
   const double began = limited ? options->clock() : 0.0;
   while (iteration < options->max_iterations) {
@@ -370,8 +370,14 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
       if (add_curvature(k, current)) status = NOT_A_NUMBER;
       with_curvature = 1;
     }
-    k->plain = 1;
+    k->plain = with_curvature || !rooted;
     if (status == OK) status = solve_program(k, current, &result->factorizations);
+    if (!rooted && !with_curvature && (status != OK || k->stationarity > ROUGH)) { /* once more, with roots */
+      rooted = 1;
+      iteration--;
+      k->stiffness = 0.0;
+      continue;
+    }
     if (status == OK && k->stationarity > 1e-6) status = INCONSISTENT; /* a gradient where there is no curvature */
     if (status != OK && with_curvature) {
       newton = with_curvature = 0;

@@ -88,54 +88,69 @@ INLINE int cholesky(double *restrict M, double *restrict D, const double *restri
   return status;
 }
 
-/* M += T' P T, T = [B A E; 0 0 I] (with the identity of w when o = 0), P full in rows and columns o..n-1; Y is work. */
-INLINE void add_plain(double *restrict M, const double *restrict P, const double *restrict J, double *restrict Y, int o,
-                      int nx, int nw, int np) {
+/* M = H + T' P T over the upper triangle, T = [B A E; 0 0 I] (with the identity of w when it is carried), P full in the
+ * rows and columns of what is behind; Y is work of nx rows. */
+INLINE void add_plain(double *restrict M, const double *restrict H, const double *restrict P, const double *restrict J,
+                      double *restrict Y, int carried, int nx, int nw, int np) {
   const int n = nw + nx + np;
-  for (int j = o; j < n; j++) {
-    double *restrict row = Y + j * n;
-    for (int l = 0; l < n; l++) row[l] = (l >= o && l < nw) || l >= nw + nx ? P[j * n + l] : 0.0;
-    for (int i = 0; i < nx; i++) {
-      const double a = P[j * n + nw + i];
-      for (int l = 0; l < n; l++) row[l] += a * J[i * n + l];
+  for (int r = 0; r < nx; r++) { /* rows of x in P T */
+    const double *restrict p = P + (nw + r) * n;
+    for (int l = 0; l < n; l++) {
+      double sum = (l < nw && carried) || l >= nw + nx ? p[l] : 0.0;
+      for (int i = 0; i < nx; i++) sum += p[nw + i] * J[i * n + l];
+      Y[r * n + l] = sum;
     }
   }
-  for (int r = 0; r < nx; r++)
-    for (int i = 0; i < n; i++) {
-      const double a = J[r * n + i];
-      for (int l = i; l < n; l++) M[i * n + l] += a * Y[(nw + r) * n + l];
+  for (int i = 0; i < n; i++)
+    for (int l = i; l < n; l++) {
+      double sum = H[i * n + l];
+      for (int r = 0; r < nx; r++) sum += J[r * n + i] * Y[r * n + l];
+      M[i * n + l] = sum;
     }
-  for (int i = o; i < n; i++)
-    if (i < nw || i >= nw + nx)
-      for (int l = i; l < n; l++) M[i * n + l] += Y[i * n + l];
+  for (int i = 0; i < n; i++) {
+    if (i < nw ? !carried : i < nw + nx) continue;
+    const double *restrict p = P + i * n;
+    for (int l = i; l < n; l++) {
+      double sum = l < nw || l >= nw + nx ? p[l] : 0.0;
+      for (int r = 0; r < nx; r++) sum += p[nw + r] * J[r * n + l];
+      M[i * n + l] += sum;
+    }
+  }
 }
 
-/* Cholesky rows for the first `count` variables; what remains is their Schur complement, both triangles. */
-INLINE int eliminate_plain(double *restrict M, double *restrict D, const double *restrict floor,
-                           const uint8_t *restrict skip, int count, int n) {
-  if (WIDE(n)) {
-    const int status = wide_eliminate(M, D, floor, skip, count, n, 1);
-    if (status) return status;
-  }
-  for (int j = 0; j < count && !WIDE(n); j++) {
+/* Rows for the first `count` variables, D their reciprocal pivots; what remains is their Schur complement, both
+ * triangles. A pivot that is zero against its diagonal gives a zero row. */
+INLINE int eliminate_plain(double *restrict M, double *restrict D, int count, int n) {
+  int status = OK;
+  for (int j = 0; j < count; j++) D[j] = PIVOT * M[j * n + j];
+  for (int j = 0; j < count; j++) {
     double *restrict row = M + j * n;
-    const double pivot = row[j];
-    if (pivot != pivot) return NOT_A_NUMBER;
-    D[j] = 0.0;
-    if (skip[j]) continue; /* its row and column are zero */
-    if (!(pivot > fabs(floor[j]))) {
-      if (pivot < -fabs(floor[j])) return INDEFINITE;
+    const double pivot = row[j], least = fabs(D[j]);
+    if (pivot > least) {
+      D[j] = 1.0 / pivot;
+    } else {
+      if (pivot != pivot) return NOT_A_NUMBER;
+      if (pivot < -least) status = INDEFINITE;
+      D[j] = 0.0;
       for (int l = j; l < n; l++) row[l] = 0.0;
-      continue;
     }
-    D[j] = 1.0 / sqrt(pivot);
-    for (int l = j; l < n; l++) row[l] *= D[j];
-    for (int i = j + 1; i < n; i++)
-      for (int l = i; l < n; l++) M[i * n + l] -= row[i] * row[l];
+    for (int i = j + 1; i < n; i++) {
+      const double factor = row[i] * D[j];
+      for (int l = i; l < n; l++) M[i * n + l] -= factor * row[l];
+    }
   }
   for (int i = count; i < n; i++)
     for (int l = i + 1; l < n; l++) M[l * n + i] = M[i * n + l];
-  return OK;
+  return status;
+}
+
+/* The same for wide slots, where the rows are scaled like those of a root. */
+INLINE int wide_plain(double *restrict M, double *restrict D, const double *restrict floor,
+                      const uint8_t *restrict skip, int count, int n) {
+  const int status = wide_eliminate(M, D, floor, skip, count, n, 1);
+  for (int i = count; i < n; i++)
+    for (int l = i + 1; l < n; l++) M[l * n + i] = M[i * n + l];
+  return status;
 }
 
 #endif

@@ -39,6 +39,7 @@
 #define MAX_BARRIER 80     /* iterations of the interior point method that takes over */
 #define INTERIOR 1e-11     /* its complementarity, relative */
 #define PIVOT 1e-13        /* a pivot this small against its diagonal is zero */
+#define ROUGH 1e-9         /* residual of a step above which the plain recursion gives way to the square-root one */
 #define STIFFNESS 1e6      /* springs against typical curvature of the states */
 #define MAX_CORRECTIONS 12
 #define HELD 1e-11         /* accuracy of a held bound, scaled */

@@ -195,7 +195,7 @@ INLINE int linearize_sized(core *k, model *m, int with_jacobian, int nx, int nw,
 }
 
 static int linearize(core *k, model *m) {
-  if (k->np) return linearize_sized(k, m, 1, NX(k->s), NW(k->s), NP(k->s));
+  if (NP(k->s) && k->np) return linearize_sized(k, m, 1, NX(k->s), NW(k->s), NP(k->s));
   return linearize_sized(k, m, 1, NX(k->s), NW(k->s), 0);
 }
 

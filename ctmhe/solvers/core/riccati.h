@@ -26,18 +26,101 @@ INLINE void pull_back(double *restrict m, const double *restrict U, const double
   for (int i = nw + nx; i < n; i++) m[i] += y[i];
 }
 
-INLINE void forward_eliminate(double *restrict m, const double *restrict U, const double *restrict D, int count,
-                              int n) {
+/* The gradient's part of an elimination: rows of a root are scaled, those of `plain` are not. */
+INLINE void forward_eliminate(double *restrict m, const double *restrict U, const double *restrict D, int count, int n,
+                              int plain) {
   for (int j = 0; j < count; j++) {
     const double l = m[j] * D[j];
-    m[j] = l;
+    if (!plain) m[j] = l;
     for (int i = j + 1; i < n; i++) m[i] -= U[j * n + i] * l;
   }
 }
 
-/* Backward sweep from slot `from`: factors and gradients, or with `right_hand_side` the gradients of k->force only. */
-INLINE int backward_sized(core *k, const model *m, int from, int right_hand_side, int nx, int nw, int np) {
-  const int n = nw + nx + np, N = k->N, nb = k->nb;
+/* The variable in front of a slot's flat index: w, x_0 or p, in the order of v. */
+INLINE size_t leading(const core *k, int slot, int j, int nx, int nw) {
+  return j < nw ? k->fw + (size_t)(slot * nw + j) : j < nw + nx ? (size_t)(j - nw) : k->fp + (size_t)(j - nw - nx);
+}
+
+/* Springs and barrier terms at a slot: into M and m, or with `right_hand_side` the forces into m only. */
+INLINE void add_forces(core *k, const double *J, double *M, double *m, int slot, int right_hand_side, int nx, int nw,
+                       int np) {
+  const int n = nw + nx + np, nb = k->nb;
+  if (k->bounded) {
+    for (int i = 0; i < nx && slot; i++) {
+      const size_t at = (size_t)(slot * nx + i);
+      if (!k->active[at]) continue;
+      if (right_hand_side) {
+        m[nw + i] += k->force[at];
+      } else {
+        k->spring[at] = k->stiffness;
+        m[nw + i] += k->z[at] - k->stiffness * (k->active[at] < 0 ? k->low[at] : k->high[at]);
+        M[(nw + i) * n + nw + i] += k->stiffness;
+      }
+    }
+    for (int i = 0; i < nb; i++) {
+      const size_t at = k->fy + (size_t)(slot * nb + i);
+      if (!k->active[at]) continue;
+      const double *row = J + (nx + i) * n;
+      double force;
+      if (right_hand_side) {
+        force = k->force[at];
+      } else {
+        double size = 0.0;
+        for (int l = 0; l < n; l++) size += row[l] * row[l];
+        const double stiff = size > 0.0 ? k->stiffness / size : 0.0;
+        k->spring[at] = stiff;
+        force = k->z[at] - stiff * (k->active[at] < 0 ? k->low[at] : k->high[at]);
+        for (int a = 0; a < n; a++)
+          for (int b = a; b < n; b++) M[a * n + b] += stiff * row[a] * row[b];
+      }
+      for (int l = 0; l < n; l++) m[l] += row[l] * force;
+    }
+  }
+  if (k->barrier) {
+    const double *push = right_hand_side ? k->force : k->barrier_force;
+    for (int i = 0; i < nx + nw + (slot ? 0 : np); i++) {
+      const size_t at = i < nw || i >= nw + nx ? leading(k, slot, i, nx, nw) : (size_t)(slot * nx + i - nw);
+      if (k->active[at]) continue;
+      m[i] += push[at];
+      if (!right_hand_side) M[i * n + i] += k->barrier_spring[at];
+    }
+    for (int i = 0; i < nb; i++) {
+      const size_t at = k->fy + (size_t)(slot * nb + i);
+      const double *row = J + (nx + i) * n, stiff = k->barrier_spring[at];
+      if (k->active[at]) continue;
+      for (int l = 0; l < n; l++) m[l] += row[l] * push[at];
+      if (!right_hand_side && stiff > 0.0)
+        for (int a = 0; a < n; a++)
+          for (int b = a; b < n; b++) M[a * n + b] += stiff * row[a] * row[b];
+    }
+  }
+  if (!right_hand_side && k->damping > 0.0)
+    for (int i = 0; i < (slot ? nw + nx : n); i++) M[i * n + i] += k->damping;
+}
+
+/* Move what is held among the `count` leading variables to the right-hand side; their rows become zero. */
+INLINE void substitute(const core *k, double *M, double *m, int slot, int count, uint8_t *skip, int nx, int nw, int np) {
+  const int n = nw + nx + np;
+  for (int j = 0; j < n; j++) skip[j] = 0;
+  if (!k->bounded) return;
+  for (int j = 0; j < count; j++) {
+    const size_t at = leading(k, slot, j, nx, nw);
+    if (!k->active[at]) continue;
+    const double target = k->active[at] < 0 ? k->low[at] : k->high[at];
+    for (int i = 0; i < n; i++) m[i] += (i < j ? M[i * n + j] : M[j * n + i]) * target;
+    skip[j] = 1;
+  }
+  for (int j = 0; j < count; j++)
+    if (skip[j]) {
+      for (int i = 0; i < j; i++) M[i * n + j] = 0.0;
+      for (int i = j; i < n; i++) M[j * n + i] = 0.0;
+    }
+}
+
+/* Backward sweep from slot `from`: factors and gradients, or with `right_hand_side` the gradients of k->force only.
+ * `calm`: nothing is held, pushed or damped. */
+INLINE int backward_sized(core *k, const model *m, int from, int right_hand_side, int calm, int nx, int nw, int np) {
+  const int n = nw + nx + np, N = k->N, nb = k->nb, plain = k->plain;
   const uint8_t *shared = k->win->shared;
   const size_t nn = (size_t)(n * n);
   uint8_t *skip = (uint8_t *)k->r;
@@ -47,7 +130,7 @@ INLINE int backward_sized(core *k, const model *m, int from, int right_hand_side
     double *U = k->U + (size_t)N * nn, *q = k->q + (size_t)N * (size_t)n;
     for (int i = 0; i < n; i++) q[i] = 0.0;
     if (!right_hand_side) memset(U, 0, sizeof(double) * nn);
-    for (int i = 0; i < nx; i++) {
+    for (int i = 0; i < nx && !calm; i++) {
       const size_t at = (size_t)(N * nx + i);
       double stiff = 0.0;
       if (k->bounded && k->active[at]) {
@@ -64,7 +147,7 @@ INLINE int backward_sized(core *k, const model *m, int from, int right_hand_side
       }
       if (!right_hand_side) {
         const double weight = stiff + k->damping;
-        U[(nw + i) * n + nw + i] = k->plain ? weight : sqrt(weight);
+        U[(nw + i) * n + nw + i] = plain ? weight : sqrt(weight);
       }
     }
     from = N - 1;
@@ -73,118 +156,55 @@ INLINE int backward_sized(core *k, const model *m, int from, int right_hand_side
     const int carried = shared[slot] && slot + 1 < N, first = slot == 0 || !shared[slot - 1], o = carried ? 0 : nw;
     double *U = k->U + (size_t)slot * nn, *D = k->D + (size_t)(slot * n), *q = k->q + (size_t)(slot * n);
     const double *behind = U + nn, *J = m->J + (size_t)(slot * (nx + nb)) * (size_t)n;
+    const double *g = m->g + (size_t)(slot * n), *H = m->H + (size_t)slot * nn;
     const int eliminated = slot == 0 ? n : first ? nw : 0;
-    if (right_hand_side)
-      for (int i = 0; i < n; i++) q[i] = 0.0;
-    else {
-      const double *g = m->g + (size_t)(slot * n), *H = m->H + (size_t)slot * nn;
-      for (int i = 0; i < n; i++) q[i] = g[i];
-      for (size_t i = 0; i < nn && !WIDE(n); i++) U[i] = H[i];
-      if (WIDE(n)) {
-        wide_add(U, H, behind, J, k->S, !k->plain, o, nx, nw, np);
-      } else if (k->plain) {
-        add_plain(U, behind, J, k->S, o, nx, nw, np);
-      } else {
-        transform(k->S, behind, J, o, nx, nw, np);
-        add_square(U, k->S + o * n, nw + nx - o, 0, n);
-        if (np) add_square(U, behind + (nw + nx) * n, np, nw + nx, n);
-      }
+    for (int i = 0; i < n; i++) q[i] = right_hand_side ? 0.0 : g[i];
+    if (right_hand_side) {
+    } else if (WIDE(n)) {
+      wide_add(U, H, behind, J, k->S, !plain, o, nx, nw, np);
+    } else if (plain) {
+      add_plain(U, H, behind, J, k->S, carried, nx, nw, np);
+    } else {
+      for (size_t i = 0; i < nn; i++) U[i] = H[i];
+      transform(k->S, behind, J, o, nx, nw, np);
+      add_square(U, k->S + o * n, nw + nx - o, 0, n);
+      if (np) add_square(U, behind + (nw + nx) * n, np, nw + nx, n);
     }
     pull_back(q, behind, k->q + (size_t)((slot + 1) * n), J,
-              right_hand_side ? NULL : m->c + (size_t)(slot * nx), k->v, k->plain, o, nx, nw, np);
-    if (k->bounded) {
-      if (slot)
-        for (int i = 0; i < nx; i++) {
-          const size_t at = (size_t)(slot * nx + i);
-          if (!k->active[at]) continue;
-          if (right_hand_side) {
-            q[nw + i] += k->force[at];
-          } else {
-            k->spring[at] = k->stiffness;
-            q[nw + i] += k->z[at] - k->stiffness * (k->active[at] < 0 ? k->low[at] : k->high[at]);
-            U[(nw + i) * n + nw + i] += k->stiffness;
-          }
-        }
-      for (int i = 0; i < nb; i++) {
-        const size_t at = k->fy + (size_t)(slot * nb + i);
-        if (!k->active[at]) continue;
-        const double *row = J + (nx + i) * n;
-        double force;
-        if (right_hand_side) {
-          force = k->force[at];
-        } else {
-          double size = 0.0;
-          for (int l = 0; l < n; l++) size += row[l] * row[l];
-          const double stiff = size > 0.0 ? k->stiffness / size : 0.0;
-          k->spring[at] = stiff;
-          force = k->z[at] - stiff * (k->active[at] < 0 ? k->low[at] : k->high[at]);
-          for (int a = 0; a < n; a++)
-            for (int b = a; b < n; b++) U[a * n + b] += stiff * row[a] * row[b];
-        }
-        for (int l = 0; l < n; l++) q[l] += row[l] * force;
-      }
-    }
-    if (k->barrier) {
-      const double *push = right_hand_side ? k->force : k->barrier_force;
-      for (int i = 0; i < nx + nw + (slot ? 0 : np); i++) {
-        const size_t at = i < nw        ? k->fw + (size_t)(slot * nw + i)
-                          : i < nw + nx ? (size_t)(slot * nx + i - nw)
-                                        : k->fp + (size_t)(i - nw - nx);
-        if (k->active[at]) continue;
-        q[i] += push[at];
-        if (!right_hand_side) U[i * n + i] += k->barrier_spring[at];
-      }
-      for (int i = 0; i < nb; i++) {
-        const size_t at = k->fy + (size_t)(slot * nb + i);
-        const double *row = J + (nx + i) * n, stiff = k->barrier_spring[at];
-        if (k->active[at]) continue;
-        for (int l = 0; l < n; l++) q[l] += row[l] * push[at];
-        if (!right_hand_side && stiff > 0.0)
-          for (int a = 0; a < n; a++)
-            for (int b = a; b < n; b++) U[a * n + b] += stiff * row[a] * row[b];
-      }
-    }
+              right_hand_side ? NULL : m->c + (size_t)(slot * nx), k->v, plain, o, nx, nw, np);
+    if (!calm) add_forces(k, J, U, q, slot, right_hand_side, nx, nw, np);
     if (!right_hand_side) {
-      if (k->damping > 0.0)
-        for (int i = 0; i < nw + nx; i++) U[i * n + i] += k->damping;
-      if (k->damping > 0.0 && slot == 0)
-        for (int i = nw + nx; i < n; i++) U[i * n + i] += k->damping;
-      for (int i = 0; i < n; i++) {
-        floor[i] = PIVOT * U[i * n + i];
-        skip[i] = 0;
+      int outcome;
+      if (plain && !WIDE(n)) {
+        if (!calm) substitute(k, U, q, slot, eliminated, skip, nx, nw, np);
+        outcome = eliminate_plain(U, D, eliminated, n);
+      } else {
+        for (int i = 0; i < n; i++) floor[i] = PIVOT * U[i * n + i];
+        substitute(k, U, q, slot, eliminated, skip, nx, nw, np);
+        outcome = plain ? wide_plain(U, D, floor, skip, eliminated, n) : cholesky(U, D, floor, skip, n);
       }
-      if (k->bounded && eliminated) {
-        for (int j = 0; j < eliminated; j++) {
-          const size_t at = j < nw ? k->fw + (size_t)(slot * nw + j)
-                                   : j < nw + nx ? (size_t)(j - nw) : k->fp + (size_t)(j - nw - nx);
-          if (!k->active[at]) continue;
-          const double target = k->active[at] < 0 ? k->low[at] : k->high[at];
-          for (int i = 0; i < n; i++) q[i] += (i < j ? U[i * n + j] : U[j * n + i]) * target;
-          skip[j] = 1;
-        }
-        for (int j = 0; j < eliminated; j++)
-          if (skip[j]) {
-            for (int i = 0; i < j; i++) U[i * n + j] = 0.0;
-            for (int i = j; i < n; i++) U[j * n + i] = 0.0;
-          }
-      }
-      const int outcome =
-          k->plain ? eliminate_plain(U, D, floor, skip, eliminated, n) : cholesky(U, D, floor, skip, n);
       if (outcome == NOT_A_NUMBER) return outcome;
       if (outcome) status = outcome;
     }
-    forward_eliminate(q, U, D, eliminated, n);
+    forward_eliminate(q, U, D, eliminated, n, plain && !WIDE(n));
   }
   return status;
 }
 
+/* Whether any bound is held. */
+static int any_held(const core *k) {
+  for (size_t at = 0; at < k->nf && k->bounded; at++)
+    if (k->active[at]) return 1;
+  return 0;
+}
+
 static int backward(core *k, const model *m, int from, int right_hand_side) {
-  if (right_hand_side) {
-    if (k->np) return backward_sized(k, m, from, 1, NX(k->s), NW(k->s), NP(k->s));
-    return backward_sized(k, m, from, 1, NX(k->s), NW(k->s), 0);
-  }
-  if (k->np) return backward_sized(k, m, from, 0, NX(k->s), NW(k->s), NP(k->s));
-  return backward_sized(k, m, from, 0, NX(k->s), NW(k->s), 0);
+  const int nx = NX(k->s), nw = NW(k->s), np = NP(k->s);
+  if (right_hand_side) return np && k->np ? backward_sized(k, m, from, 1, 0, nx, nw, np)
+                                          : backward_sized(k, m, from, 1, 0, nx, nw, 0);
+  if (k->barrier || k->damping > 0.0 || any_held(k))
+    return np && k->np ? backward_sized(k, m, from, 0, 0, nx, nw, np) : backward_sized(k, m, from, 0, 0, nx, nw, 0);
+  return np && k->np ? backward_sized(k, m, from, 0, 1, nx, nw, np) : backward_sized(k, m, from, 0, 1, nx, nw, 0);
 }
 
 /* Solve for `count` leading variables of v, those behind them known. */
@@ -241,9 +261,9 @@ INLINE void forward_sized(core *k, const model *m, int correction, int nx, int n
 
 static void forward(core *k, const model *m, int correction) {
   if (correction) {
-    if (k->np) forward_sized(k, m, 1, NX(k->s), NW(k->s), NP(k->s));
+    if (NP(k->s) && k->np) forward_sized(k, m, 1, NX(k->s), NW(k->s), NP(k->s));
     else forward_sized(k, m, 1, NX(k->s), NW(k->s), 0);
-  } else if (k->np) forward_sized(k, m, 0, NX(k->s), NW(k->s), NP(k->s));
+  } else if (NP(k->s) && k->np) forward_sized(k, m, 0, NX(k->s), NW(k->s), NP(k->s));
   else forward_sized(k, m, 0, NX(k->s), NW(k->s), 0);
 }
 
@@ -336,7 +356,7 @@ INLINE void adjoint_sized(core *k, const model *m, int nx, int nw, int np) {
 }
 
 static void adjoint(core *k, const model *m) {
-  if (k->np) adjoint_sized(k, m, NX(k->s), NW(k->s), NP(k->s));
+  if (NP(k->s) && k->np) adjoint_sized(k, m, NX(k->s), NW(k->s), NP(k->s));
   else adjoint_sized(k, m, NX(k->s), NW(k->s), 0);
 }
 
