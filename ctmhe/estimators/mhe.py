@@ -19,7 +19,7 @@ from ctmhe.estimators.state import State, load_state, save_state
 from ctmhe.models.continuous import Model
 from ctmhe.models.signals import Signals
 from ctmhe.solvers.base import Solution, Solver
-from ctmhe.solvers.compiled import CompiledGaussNewton, compiled_solver
+from ctmhe.solvers.compiled import compiled_solver
 from ctmhe.solvers.gauss_newton import GaussNewton
 from ctmhe.solvers.ipopt import Ipopt
 from ctmhe.solvers.ladder import climb
@@ -210,13 +210,15 @@ class MHE:
         if compile not in ("off", "auto"):
             raise InputError(f"compile must be 'off' or 'auto', got {compile!r}")
         self._solver: Solver = self._reference if solver == "ipopt" else self._gauss_newton
+        compiled = None
         if solver == "gauss-newton":
             compiled = compiled_solver(self.stage, specialise=compile == "auto", **limits)
             self._solver = compiled or self._gauss_newton
+        self._covariance = (compiled or self._gauss_newton).covariance
         self._layout = Layout.of(self.stage)
         self._updates = None
-        if isinstance(self._solver, CompiledGaussNewton) and CompiledUpdates.covers(self.assembly):
-            self._updates = CompiledUpdates(self._solver, self.assembly, self._layout, real_time=self._real_time)
+        if compiled is not None and CompiledUpdates.covers(self.assembly):
+            self._updates = CompiledUpdates(compiled, self.assembly, self._layout, real_time=self._real_time)
         self._check = Ipopt(self.stage, options={"ipopt.mu_init": 1e-8}) if verify else None
         self._holds = bool(self.assembly.held.any())
         self._silent = np.zeros(len(model.w))
@@ -477,7 +479,7 @@ class MHE:
 
         def covariance() -> tuple[Array, int]:
             window, _ = self._window(state, t)
-            values, rank = self._gauss_newton.covariance(window, solved.guess)
+            values, rank = self._covariance(window, solved.guess)
             return frozen(values), rank
 
         seconds = self.clock() - began

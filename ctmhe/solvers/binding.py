@@ -204,6 +204,7 @@ def load(library: Path) -> ctypes.CDLL:
     core.ctmhe_update_size.argtypes, core.ctmhe_update_size.restype = [_pointer, _int], ctypes.c_size_t
     core.ctmhe_assemble.argtypes, core.ctmhe_assemble.restype = [_pointer] * 6, _int
     core.ctmhe_update.argtypes, core.ctmhe_update.restype = [_pointer] * 7, _int
+    core.ctmhe_covariance.argtypes, core.ctmhe_covariance.restype = [_pointer] * 6, _int
     core.ctmhe_sizes.argtypes, core.ctmhe_sizes.restype = [_pointer] * 6, None
     return core
 

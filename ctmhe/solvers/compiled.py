@@ -94,11 +94,7 @@ class CompiledGaussNewton:
 
     def solve(self, window: Window, guess: Guess) -> Solution:
         """Return the solution from `guess`; never raises for numerical trouble."""
-        memory: _Memory | None = getattr(self._local, "memory", None)
-        n = len(window.mesh.h)
-        if memory is None or memory.capacity < n:
-            capacity = max(32, n if memory is None else n + n // 2)
-            memory = self._local.memory = _Memory(self.core, self.stage, self.options(), capacity)
+        memory, n = self._memory(window), len(window.mesh.h)
         memory.write(window, guess, n)
         stop = self.core.ctmhe_solve(*memory.pointers)
         result = memory.result
@@ -120,6 +116,28 @@ class CompiledGaussNewton:
             Multipliers(*multipliers),
             STOPPED.get(stop),
         )
+
+    def covariance(self, window: Window, point: Guess) -> tuple[Array, int]:
+        """Return the covariance of (x at the window's end, estimated p) and the number of determined directions.
+
+        What `GaussNewton.covariance` returns.
+        """
+        memory = self._memory(window)
+        memory.write(window, point, len(window.mesh.h))
+        size = self.stage.nx + self.stage.np * window.p_estimated
+        covariance, rank = np.empty((size, size)), ctypes.c_int()
+        stage, header, _, result, scratch = memory.pointers
+        self.core.ctmhe_covariance(stage, header, result, covariance.ctypes.data, ctypes.addressof(rank), scratch)
+        return covariance, rank.value
+
+    def _memory(self, window: Window) -> _Memory:
+        """Return this thread's arrays, with room for a window."""
+        memory: _Memory | None = getattr(self._local, "memory", None)
+        n = len(window.mesh.h)
+        if memory is None or memory.capacity < n:
+            capacity = max(32, n if memory is None else n + n // 2)
+            memory = self._local.memory = _Memory(self.core, self.stage, self.options(), capacity)
+        return memory
 
     def _message(self, stop: int) -> str:
         return {

@@ -15,6 +15,7 @@
  */
 #include "model.h"
 #include "program.h"
+#include "covariance.h"
 #include "update.h"
 
 size_t ctmhe_scratch_size(const ctmhe_stage *stage, int n) {

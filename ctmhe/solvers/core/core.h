@@ -149,6 +149,13 @@ size_t ctmhe_scratch_size(const ctmhe_stage *stage, int n);
 int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmhe_options *options,
                 ctmhe_result *result, void *scratch);
 
+/* Covariance of (x at the window's end, estimated p), (m, m), and the number of directions that are determined, at a
+ * point whose x, w, p are given: the inverse of half the Gauss-Newton Hessian of J reduced by the dynamics, bounds
+ * ignored. Variances that the window does not determine are infinite, their covariances NaN. Returns CTMHE_CONVERGED or
+ * CTMHE_NOT_FINITE. Scratch as for ctmhe_solve. */
+int ctmhe_covariance(const ctmhe_stage *stage, const ctmhe_window *window, const ctmhe_result *point,
+                     double *covariance, int *rank, void *scratch);
+
 /* Sizes compiled in (all zero in the shipped build), and the version: a loader refuses what does not fit. */
 void ctmhe_sizes(int *nx, int *nw, int *np, int *ny, int *q, int *version);
 

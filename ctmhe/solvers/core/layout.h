@@ -44,7 +44,7 @@
 #define MAX_CORRECTIONS 12
 #define HELD 1e-11         /* accuracy of a held bound, scaled */
 #define TILE 4
-#define WIDE_FROM 16 /* variables of a slot: the kernels of wide.h, with more work */
+#define WIDE_FROM 16 /* variables of a slot: the kernels of wide.h */
 
 enum { OK = 0, INDEFINITE = 1, NOT_A_NUMBER = 2, INCONSISTENT = 3 };
 enum { ZERO = 0, DIAGONAL = 1, DENSE = 2 };
@@ -128,7 +128,7 @@ static size_t lay_out(core *k, char *scratch, const ctmhe_stage *s, int slots, i
   k->P = DOUBLES(&memory, (nx + (size_t)np) * (nx + (size_t)np));
   k->rows = DOUBLES(&memory, qy * n + 1);
   k->residual = DOUBLES(&memory, qy + 1);
-  k->S = DOUBLES(&memory, (n < WIDE_FROM ? n + TILE : 4 * n) * n);
+  k->S = DOUBLES(&memory, (6 * n + TILE) * n);
   k->t = DOUBLES(&memory, n0 + n);
   k->v = DOUBLES(&memory, n0 + n);
   k->r = DOUBLES(&memory, n0 + n);

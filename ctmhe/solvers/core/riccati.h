@@ -318,15 +318,19 @@ INLINE void adjoint_sized(core *k, const model *m, int nx, int nw, int np) {
       if (a != 0.0)
         for (int l = 0; l < n; l++) r[l] += a * J[(nx + i) * n + l];
     }
-    for (int i = 0; i < np; i++) rp[i] += r[nw + nx + i];
     for (int i = 0; i < nw; i++) rw[i] += r[i];
-    if (slot == 0 || !shared[slot - 1])
+    if (slot == 0 || !shared[slot - 1]) {
       for (int i = 0; i < nw; i++) {
         const size_t at = k->fw + (size_t)(slot * nw + i);
         if (k->bounded && k->active[at]) k->z[at] = -rw[i];
         else if (fabs(rw[i]) > residual) residual = fabs(rw[i]);
+        r[i] = rw[i];
         rw[i] = 0.0;
       }
+      /* what rounding left of w's gradient acts on x as in the backward sweep: an unstable model would let it grow */
+      if (slot) forward_eliminate(r, k->U + (size_t)slot * (size_t)(n * n), k->D + (size_t)(slot * n), nw, n, k->plain && !WIDE(n));
+    }
+    for (int i = 0; i < np; i++) rp[i] += r[nw + nx + i];
     if (slot == 0) {
       for (int i = 0; i < nx; i++) {
         if (k->bounded && k->active[i]) k->z[i] = -r[nw + i];
