@@ -188,14 +188,13 @@ class MHE:
         self.hold_limit = self.horizon if hold_limit is None else positive("hold_limit", hold_limit, "seconds")
         self.hold = dict(zip(model.y.names, hold_kinds(model, hold), strict=True))
         signal = any(kind != "point" for kind in self.hold.values())
-        self.stage = StageFunction(model, integrator, signal=signal)
+        self.stage = StageFunction(model, integrator, signal=signal, interval=self.interval)
         self.assembly = Assembly(
             model,
             self.stage,
             cost,
             self.bounds,
             interval=self.interval,
-            parts=integrator.parts(self.interval),
             hold=hold,
             hold_limit=self.hold_limit,
             input_hold=input_hold,

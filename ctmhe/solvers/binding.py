@@ -12,9 +12,10 @@ import casadi as ca
 import numpy as np
 
 from ctmhe.errors import SolverError
+from ctmhe.solvers.tape import BATCH, tape_of
 from ctmhe.transcription.stage import StageFunction
 
-VERSION = 3
+VERSION = 4
 MAX_ARGUMENTS = 64
 CONVERGED, ITERATION_LIMIT, NOT_FINITE, NO_DECREASE, SINGULAR, DEADLINE = range(6)
 STAGE_FUNCTIONS = ("ctmhe_stage_value", "ctmhe_stage_jacobian", "ctmhe_stage_curvature")
@@ -30,8 +31,9 @@ class Function(ctypes.Structure):
     """A stage function and its memory."""
 
     _fields_ = [
-        ("function", _pointer), ("iw", _pointer), ("w", _pointer), ("eval", _pointer), ("self", _pointer),
-        ("failed", _pointer), ("arg", _pointer * 9), ("res", _pointer * 3),
+        ("function", _pointer), ("iw", _pointer), ("w", _pointer), ("tape", _pointer), ("constants", _pointer),
+        ("registers", _pointer), ("tape_length", _int), ("eval", _pointer), ("self", _pointer), ("failed", _pointer),
+        ("arg", _pointer * 9), ("res", _pointer * 3),
     ]  # fmt: skip
 
 
@@ -39,7 +41,8 @@ class Stage(ctypes.Structure):
     """The model's functions and sizes."""
 
     _fields_ = [
-        *((name, _int) for name in ("nx", "nw", "np", "nu", "ny", "q", "symbolic")),
+        *((name, _int) for name in ("nx", "nw", "np", "nu", "ny", "q", "steps")),
+        ("step_length", _double), ("symbolic", _int),
         *((name, Function) for name in ("value", "jacobian", "curvature")),
     ]
 
@@ -83,7 +86,7 @@ class ResultHeader(ctypes.Structure):
 
 
 NUMBERS = ("interval", "hold_limit", "rate", "prior_rate")
-SWITCHES = ("parts", "discrete", "filtering", "end_slot", "input_linear", "p_estimated", "diagonal_R", "diagonal_point")
+SWITCHES = ("discrete", "filtering", "end_slot", "input_linear", "p_estimated", "diagonal_R", "diagonal_point")
 CONSTANTS = (
     "held", "linear", "nodes", "shares", "root_P", "root_Q", "root_R", "root_point", "root_S", "x_lower", "x_upper",
     "w_lower", "w_upper", "y_lower", "y_upper", "residual_lower", "residual_upper", "p_lower", "p_upper", "x_scale",
@@ -127,10 +130,12 @@ class Functions:
         structures = []
         for name, function in zip(STAGE_FUNCTIONS, functions, strict=False):
             exported = getattr(core, name, None)
-            structures.append(self._virtual(stage, function) if exported is None else self._compiled(core, name))
-        self.structure = Stage(
-            stage.nx, stage.nw, stage.np, stage.nu, stage.ny, stage.q, bool(stage.symbolic), *structures
-        )
+            if exported is not None:
+                structures.append(self._compiled(core, name))
+            else:
+                structures.append(self._taped(function) or self._virtual(stage, function))
+        sizes = (stage.nx, stage.nw, stage.np, stage.nu, stage.ny, stage.q, stage.steps)
+        self.structure = Stage(*sizes, stage.step_length, bool(stage.symbolic), *structures)
 
     def _compiled(self, core: ctypes.CDLL, name: str) -> Function:
         sizes = (ctypes.c_longlong * 4)()
@@ -143,6 +148,19 @@ class Functions:
         self.kept += [iw, w]
         address = ctypes.cast(getattr(core, name), ctypes.c_void_p).value
         return Function(function=address, iw=iw.ctypes.data, w=w.ctypes.data)
+
+    def _taped(self, function: ca.Function) -> Function | None:
+        tape = tape_of(function)
+        if tape is None:
+            return None
+        registers = np.zeros(BATCH * tape.registers + 8)
+        self.kept += [tape, registers]
+        return Function(
+            tape=tape.instructions.ctypes.data,
+            constants=tape.constants.ctypes.data,
+            registers=-(-registers.ctypes.data // 64) * 64,
+            tape_length=len(tape.instructions),
+        )
 
     def _virtual(self, stage: StageFunction, function: ca.Function) -> Function:
         inputs = [np.zeros(max(function.nnz_in(i), 1)) for i in range(function.n_in())]

@@ -31,6 +31,8 @@ OPTIONS: dict[str, Any] = {
     "calc_lam_p": False,
 }
 
+LARGE = 20_000  # instructions of a slot up to which it becomes one scalar expression
+
 
 @dataclass(frozen=True, eq=False)
 class _Program:
@@ -206,9 +208,10 @@ class Ipopt:
     def _slot_function(self) -> ca.Function:
         """Return (t, h, x, w, p, u0, u1, L_w, L_y, y_data) -> (x_next, y_end, weighted residuals) of one slot."""
         stage = self.stage
-        kind: Any = ca.SX if stage.symbolic else ca.MX
+        small = stage.symbolic and stage.steps * stage.value.n_instructions() < LARGE
+        kind: Any = ca.SX if small else ca.MX
         symbols = [kind.sym(stage.value.name_in(i), stage.value.size1_in(i)) for i in range(stage.value.n_in())]
-        x_next, y = stage.value(*symbols)
+        x_next, y = self._chained(symbols) if stage.steps > 1 else stage.value(*symbols)
         ny, nw, q = stage.ny, stage.nw, stage.q
         Lw, Ly, data = kind.sym("Lw", nw * nw), kind.sym("Ly", q * ny * ny), kind.sym("y", q * ny)
         residuals = [ca.reshape(Lw, nw, nw) @ symbols[3]]
@@ -218,6 +221,21 @@ class Ipopt:
         return ca.Function(
             "weighted_slot", [*symbols, Lw, Ly, data], [x_next, y[(q - 1) * ny :], ca.vertcat(*residuals)]
         )
+
+    def _chained(self, symbols: list[Any]) -> tuple[Any, Any]:
+        """Return x_next and y (q ny) of a slot of as many steps as it needs; those behind them have length zero."""
+        stage, (t, h, x, w, p, u0, u1) = self.stage, symbols
+        steps = ca.fmin(ca.fmax(ca.ceil(h / stage.step_length * (1 - 1e-9)), 1), stage.steps)
+        inside, ny = len(stage.nodes) * stage.ny, stage.ny
+        outputs, end = [], type(x).zeros(ny)
+        for i in range(stage.steps):
+            begin, stop = ca.fmin(i, steps) / steps, ca.fmin(i + 1, steps) / steps
+            inputs = (u0 + (u1 - u0) * begin, u0 + (u1 - u0) * stop)
+            x, y = stage.value(t + begin * h, (stop - begin) * h, x, w, p, *inputs)
+            if inside:
+                outputs.append(y[:inside])
+            end = y[inside:]
+        return x, ca.vertcat(*outputs, end)
 
     def _bounds(self, window: Window, spare: Array, x: Array, w: Array, p: Array, free: float) -> Array:
         n, stage = len(window.mesh), self.stage

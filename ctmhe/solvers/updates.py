@@ -271,7 +271,6 @@ def _estimator(assembly: Assembly) -> tuple[EstimatorHeader, list[np.ndarray]]:
         hold_limit=assembly.hold_limit,
         rate=assembly.rate,
         prior_rate=assembly.prior_rate,
-        parts=assembly.parts,
         discrete=assembly.discrete,
         filtering=assembly.filtering,
         end_slot=assembly.end_slot,

@@ -42,8 +42,6 @@ class Assembly:
     bounds : Bounds
     interval : float
         Shooting interval and disturbance cell, seconds; the step for a `DiscreteModel`.
-    parts : int
-        Integration steps a cell.
     hold : str or mapping output -> str
         How each output's samples enter: `zero`, `linear` (the whole signal, weighted by R) or `point` (each sample at
         its time, weighted by R_point).
@@ -62,14 +60,13 @@ class Assembly:
         bounds: Bounds,
         *,
         interval: float,
-        parts: int,
         hold: Any,
         hold_limit: float,
         input_hold: str,
         filtering: bool,
     ):
         self.model, self.stage, self.cost = model, stage, cost
-        self.interval, self.parts, self.hold_limit = interval, parts, hold_limit
+        self.interval, self.hold_limit = interval, hold_limit
         self.filtering = filtering
         self.end_slot = filtering or cost.S is not None  # discrete: a slot of no length that carries the newest output
         self.discrete = model.step is not None
@@ -110,7 +107,7 @@ class Assembly:
         at_start = samples[np.abs(samples - start) <= same_time(self.interval, start)]
         point = bool(growing and len(at_start) and np.isfinite(records.y[:, ~self.held]).any())
         instants = np.concatenate([samples, records.u_times, *self._expiries(records)])
-        return build_mesh(start, end, self.interval, self.parts, instants, sample_at_start=point)
+        return build_mesh(start, end, self.interval, instants, sample_at_start=point)
 
     def _expiries(self, records: Records) -> list[Array]:
         """Return when held samples stop counting because no newer one has come: the integrand jumps there."""
@@ -204,7 +201,8 @@ class Assembly:
         y_data = np.zeros((n, stage.q, ny))
         known = np.zeros((n, stage.q, ny), dtype=bool)
         starts = mesh.t[:-1]
-        times = np.concatenate([starts[:, None] + mesh.h[:, None] * stage.nodes, mesh.t[1:, None]], axis=1)
+        nodes, shares = stage.quadrature(mesh.h)
+        times = np.concatenate([starts[:, None] + nodes, mesh.t[1:, None]], axis=1)
         for s in np.flatnonzero(self.held):
             valid = np.isfinite(records.y[:, s])
             y_data[:, :, s], known[:, :, s] = held_signal(
@@ -219,8 +217,8 @@ class Assembly:
         end_known = known[:, -1].copy()
         known[:, -1] = False
         L_y = np.zeros((n, stage.q, ny, ny))
-        for i, share in enumerate(stage.weights):
-            weight = np.sqrt(mesh.h * share * np.exp(-self.rate * (end - times[:, i])))
+        for i, share in enumerate(shares.T):
+            weight = np.sqrt(share * np.exp(-self.rate * (end - times[:, i])))
             L_y[:, i] = weight[:, None, None] * self.R.roots(times[:, i], known[:, i])
         sample, edge = point_rows(records.y_times, mesh.t, mesh.tolerance)
         if mesh.h[0] == 0.0:  # the samples at the window's start belong to the end of the slot of no length

@@ -1,4 +1,4 @@
-"""The mesh of a window: slots between the union of cell edges, steps, measurements and input switches."""
+"""The mesh of a window: slots between the union of cell edges, measurements and input switches."""
 
 from __future__ import annotations
 
@@ -45,9 +45,7 @@ class Mesh:
         return len(self.h)
 
 
-def build_mesh(
-    start: float, end: float, interval: float, parts: int, instants: Array, *, sample_at_start: bool
-) -> Mesh:
+def build_mesh(start: float, end: float, interval: float, instants: Array, *, sample_at_start: bool) -> Mesh:
     """Return the mesh of [start, end].
 
     Parameters
@@ -56,18 +54,14 @@ def build_mesh(
         The window's edges.
     interval : float
         Length of a disturbance cell; cells are anchored at its absolute multiples, whatever the window's edges.
-    parts : int
-        Integration steps a cell, anchored likewise.
     instants : array
         Measurement times and input switches, in any order, also outside the window.
     sample_at_start : bool
         Put a slot of length zero in front, whose end is the window's start: a sample there has its residual at once.
     """
     tolerance = same_time(interval, end)
-    first, last = int(np.floor(start / interval * parts)), int(np.ceil(end / interval * parts))
-    k = np.arange(first, last + 1)
-    steps = (k // parts) * interval + (k % parts) * (interval / parts)
-    inside = np.concatenate([steps, instants])
+    cells = np.arange(np.floor(start / interval), np.ceil(end / interval) + 1) * interval
+    inside = np.concatenate([cells, instants])
     inside = np.sort(inside[(inside > start + tolerance) & (inside < end - tolerance)])
     if len(inside):
         inside = inside[np.concatenate([[True], np.diff(inside) > tolerance])]

@@ -1,4 +1,4 @@
-"""Integrators of one slot: fixed-step Runge-Kutta and CVODES, as configuration."""
+"""Integrators of one step: fixed-step Runge-Kutta and CVODES, as configuration."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ ROUND_OFF = 1e-14
 
 @runtime_checkable
 class Integrator(Protocol):
-    """Carries the state over one slot and visits the nodes of the output integral.
+    """Carries the state over one integration step and visits the nodes of the output integral.
 
-    `nodes` and `weights` are the quadrature of the slot [0, 1]: the integral of g is the sum of weights * g(nodes).
+    `nodes` and `weights` are the quadrature of a step [0, 1]: the integral of g is the sum of weights * g(nodes).
     `accuracy` is how finely results respond to arguments, relative: what a solver cannot ask beyond.
     """
 
@@ -35,15 +35,15 @@ class Integrator(Protocol):
         ...
 
     def trace(self, model: Model, signal: bool) -> ca.Function:
-        """Return the function (t, h, x, w, p, u0, u1) -> (x_next, y) over one slot of h seconds.
+        """Return the function (t, h, x, w, p, u0, u1) -> (x_next, y) over one step of h seconds.
 
-        y (ny, q+1): outputs at the q nodes (none unless `signal`), then at the slot's end.
+        y (ny, nodes + 1): outputs at the nodes (none unless `signal`), then at the step's end.
         """
         ...
 
 
-def slot_symbols(model: Model, kind: Any) -> list[Any]:
-    """Return the symbols (t, h, x, w, p, u0, u1) of a slot."""
+def step_symbols(model: Model, kind: Any) -> list[Any]:
+    """Return the symbols (t, h, x, w, p, u0, u1) of a step."""
     sizes = {"t": 1, "h": 1, "x": len(model.x), "w": len(model.w), "p": len(model.p)}
     sizes |= {"u0": len(model.u), "u1": len(model.u)}
     return [kind.sym(name, size) for name, size in sizes.items()]
@@ -56,7 +56,7 @@ def is_symbolic(model: Model) -> bool:
 
 @dataclass(frozen=True)
 class RK4:
-    """The classic Runge-Kutta method of order 4, one step a slot.
+    """The classic Runge-Kutta method of order 4, in equal steps within a slot.
 
     The output integral is the augmented RK4: residuals at the four stages with weights h/6, h/3, h/3, h/6.
 
@@ -81,7 +81,7 @@ class RK4:
 
     def trace(self, model: Model, signal: bool) -> ca.Function:
         """Return (t, h, x, w, p, u0, u1) -> (x_next, y): see `Integrator`."""
-        symbols = slot_symbols(model, ca.SX if is_symbolic(model) else ca.MX)
+        symbols = step_symbols(model, ca.SX if is_symbolic(model) else ca.MX)
         t, h, x, w, p, u0, u1 = symbols
         middle = (u0 + u1) / 2
         k1 = model.dynamics(t, x, u0, w, p)
@@ -96,7 +96,7 @@ class RK4:
         if signal:
             stages = ((t, x, u0), (t + h / 2, x2, middle), (t + h / 2, x3, middle), (t + h, x4, u1))
             outputs = [model.output(*stage, w, p) for stage in stages] + outputs
-        return ca.Function("slot", symbols, [end, ca.horzcat(*outputs)])
+        return ca.Function("step", symbols, [end, ca.horzcat(*outputs)])
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class CVODES:
     def trace(self, model: Model, signal: bool) -> ca.Function:
         """Return (t, h, x, w, p, u0, u1) -> (x_next, y): see `Integrator`."""
         kind: Any = ca.SX if is_symbolic(model) else ca.MX
-        t, h, x, w, p, u0, u1 = slot_symbols(model, kind)
+        t, h, x, w, p, u0, u1 = step_symbols(model, kind)
         s = kind.sym("s")
         scale = ca.DM(np.asarray(model.x.nominal))
         parameters = ca.vertcat(t, h, w, p, u0, u1)
@@ -141,11 +141,11 @@ class CVODES:
         grid = [*self.nodes, 1.0] if signal else [1.0]
         options = {"reltol": self.rtol, "abstol": self.atol, "max_num_steps": 10_000}
         flow = ca.integrator("flow", "cvodes", {"x": x, "t": s, "p": parameters, "ode": rate}, 0.0, grid, options)
-        symbols = slot_symbols(model, ca.MX)
+        symbols = step_symbols(model, ca.MX)
         t, h, x, w, p, u0, u1 = symbols
         states = flow(x0=x / scale, p=ca.vertcat(t, h, w, p, u0, u1))["xf"]
         outputs = [model.output(t + c * h, states[:, i] * scale, u0 + c * (u1 - u0), w, p) for i, c in enumerate(grid)]
-        return ca.Function("slot", symbols, [states[:, -1] * scale, ca.horzcat(*outputs)])
+        return ca.Function("step", symbols, [states[:, -1] * scale, ca.horzcat(*outputs)])
 
 
 @dataclass(frozen=True)
@@ -166,7 +166,7 @@ class StepMap:
 
     def trace(self, model: Model, signal: bool) -> ca.Function:
         """Return (t, h, x, w, p, u0, u1) -> (x_next, y) with y taken at the start of the step."""
-        symbols = slot_symbols(model, ca.SX if is_symbolic(model) else ca.MX)
+        symbols = step_symbols(model, ca.SX if is_symbolic(model) else ca.MX)
         t, h, x, w, p, u0, _ = symbols
         x_next = ca.if_else(h > 0, model.dynamics(t, x, u0, w, p), x)
-        return ca.Function("slot", symbols, [x_next, model.output(t, x, u0, w, p)])
+        return ca.Function("step", symbols, [x_next, model.output(t, x, u0, w, p)])

@@ -42,12 +42,12 @@ def library(tmp_path_factory) -> Path:
     return build(tmp_path_factory.mktemp("core") / "core.so")
 
 
-def build(target: Path, *flags: str) -> Path:
-    """Compile the core."""
+def build(target: Path, *flags: str, source: Path = SOURCE) -> Path:
+    """Compile the core, or what includes it."""
     if COMPILER is None:
         pytest.skip("no C compiler found ($CC, cc, gcc, clang)")
     options = ["-O2", "-std=c99", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", *flags]
-    subprocess.run([COMPILER, *options, str(SOURCE), "-o", str(target), "-lm"], check=True)
+    subprocess.run([COMPILER, *options, str(source), "-o", str(target), "-lm"], check=True)
     return target
 
 

@@ -16,16 +16,15 @@ from ctmhe.transcription.weights import observed_part, square_root, weight_matri
     st.floats(-50, 50),
     st.floats(1e-3, 5.0),
     st.floats(0.01, 1.0),
-    st.integers(1, 5),
     st.lists(st.floats(-60, 60), max_size=8),
 )
-def test_slots_tile_the_window_and_never_straddle_a_cell_or_a_sample(start, length, interval, parts, instants):
+def test_slots_tile_the_window_and_never_straddle_a_cell_or_a_sample(start, length, interval, instants):
     """Lengths add up; every cell edge and every sample inside is an edge; one cell, one number."""
     end = start + length
-    mesh = build_mesh(start, end, interval, parts, np.array(instants), sample_at_start=False)
+    mesh = build_mesh(start, end, interval, np.array(instants), sample_at_start=False)
     assert mesh.t[0] == start and mesh.t[-1] == end
     assert mesh.h.sum() == pytest.approx(length, abs=1e-12 * max(1, abs(start)))
-    assert (mesh.h > 0).all() and mesh.h.max() <= interval / parts * (1 + 1e-9)
+    assert (mesh.h > 0).all() and mesh.h.max() <= interval * (1 + 1e-9)
     slack = mesh.tolerance
     for t in instants:
         if start < t < end:

@@ -17,22 +17,33 @@
 extern "C" {
 #endif
 
-#define CTMHE_CORE_VERSION 3
+#define CTMHE_CORE_VERSION 4
+#define CTMHE_BATCH 8          /* slots that a tape is run for at once */
 #define CTMHE_MAX_ARGUMENTS 64 /* pointers a compiled stage function may use (CasADi's sz_arg, sz_res) */
 
-/* The stage function over one slot, in CasADi's own calling convention:
- * arguments t, h, x (nx), w (nw), p (np), u0 (nu), u1 (nu) [, lambda_x (nx), lambda_y (q*ny)]
- * results of `jacobian`: x_next (nx), y (q*ny), J (nx + q*ny rows, nx + nw + np columns, column-major)
- * results of `value`: x_next, y;  of `curvature`: H (n x n, n = nx + nw + np) */
+/* The stage function over one integration step, in CasADi's own calling convention, with y at r points of the step:
+ * arguments t, h, x (nx), w (nw), p (np), u0 (nu), u1 (nu) [, lambda_x (nx), lambda_y (r*ny)]
+ * results of `jacobian`: x_next (nx), y (r*ny), J (nx + r*ny rows, nx + nw + np columns, column-major)
+ * results of `value`: x_next, y;  of `curvature`: H (n x n, n = nx + nw + np)
+ * A slot is covered by as few equal steps as its length needs; its outputs are those at the first r - 1 points of each
+ * step and at its end, q = steps (r - 1) + 1. */
 typedef int (*ctmhe_casadi)(const double **arg, double **res, long long *iw, double *w, int mem);
 
 /* CasADi's evaluation buffer (the VM): eval(self) reads and writes memory bound beforehand. */
 typedef void (*ctmhe_buffer_eval)(void *self);
 
 typedef struct {
+  int32_t operation, target, left, right; /* see tape.h */
+} ctmhe_instruction;
+
+typedef struct {
   ctmhe_casadi function;      /* compiled function, or NULL */
   long long *iw;              /* its work vectors */
   double *w;
+  const ctmhe_instruction *tape; /* else its instructions, or NULL */
+  const double *constants;
+  double *registers;          /* CTMHE_BATCH each, aligned to 64 bytes */
+  int tape_length;
   ctmhe_buffer_eval eval;     /* else the VM's buffer */
   void *self;
   const int *failed;          /* set by the VM's wrapper when an evaluation failed; may be NULL */
@@ -42,6 +53,8 @@ typedef struct {
 
 typedef struct {
   int nx, nw, np, nu, ny, q;  /* np: all parameters of the stage function */
+  int steps;                  /* of the longest slot */
+  double step_length;         /* seconds, of the longest step */
   int symbolic;               /* `curvature` exists */
   ctmhe_function value, jacobian, curvature;
 } ctmhe_stage;
@@ -97,11 +110,10 @@ typedef struct {              /* in and out */
 typedef struct {              /* an estimator: what does not change from update to update */
   double interval;            /* cell on which w is constant, seconds; the step of a discrete model */
   double hold_limit, rate, prior_rate; /* seconds; discounts per second */
-  int parts;                  /* integration steps a cell */
   int discrete, filtering, end_slot, input_linear, p_estimated;
   int diagonal_R, diagonal_point; /* the roots below are diagonal; root_S always is */
   const uint8_t *held, *linear; /* (ny) how each sensor's samples enter */
-  const double *nodes, *shares; /* (q - 1) quadrature of a slot */
+  const double *nodes, *shares; /* (r - 1) quadrature of an integration step */
   const double *root_P, *root_Q, *root_R, *root_point, *root_S; /* square roots of the weights; root_S may be NULL */
   const double *x_lower, *x_upper, *w_lower, *w_upper, *y_lower, *y_upper, *residual_lower, *residual_upper;
   const double *p_lower, *p_upper, *x_scale, *w_scale, *p_scale, *y_scale;

@@ -21,6 +21,9 @@
 #define NQ(s) ((s)->q)
 #endif
 
+#define BATCH CTMHE_BATCH
+#define POINTS(s) ((NQ(s) - 1) / (s)->steps + 1) /* output evaluations of one integration step */
+
 #if defined(__GNUC__)
 #define INLINE static inline __attribute__((always_inline))
 #else
@@ -81,7 +84,8 @@ typedef struct {
   double *lambda;          /* (N, nx) */
   int8_t *active, *candidate, *cautious, *kept;
   uint8_t *fixed;
-  double *scratch_y;       /* nx + q ny + Jacobian of one slot for compiled functions, and n0 x n0 */
+  double *lane, *steps;    /* results of the slots evaluated at once; work of their steps */
+  double *second;          /* second derivatives of one slot, with work */
   model a, b;
   int plain;               /* with second derivatives: keep P = U'U itself, which may be indefinite */
   double stiffness, damping;
@@ -111,6 +115,18 @@ static void lay_out_model(model *m, arena *memory, size_t N, size_t nx, size_t n
   m->H = DOUBLES(memory, N * n * n);
   m->g = DOUBLES(memory, N * n);
   m->J = DOUBLES(memory, N * (nx + nb) * n);
+}
+
+/* Doubles of work for one integration step, and for the second derivatives of a slot: see slot.h. */
+static size_t step_work_size(const ctmhe_stage *s, int derivatives) {
+  const size_t nx = (size_t)NX(s), outputs = (size_t)(POINTS(s) * NY(s)), n0 = nx + (size_t)(NW(s) + NP(s));
+  return 2 * (size_t)s->nu + 2 * nx + outputs + (derivatives ? (nx + outputs) * n0 : 0);
+}
+
+static size_t curvature_work_size(const ctmhe_stage *s) {
+  const size_t n0 = (size_t)(NX(s) + NW(s) + NP(s)), nx = (size_t)NX(s), steps = (size_t)s->steps;
+  const size_t outputs = (size_t)(POINTS(s) * NY(s)), each = step_work_size(s, 1);
+  return n0 * n0 + nx + outputs + (steps > 1 ? steps * (each + nx * n0) + 3 * n0 * n0 : 0);
 }
 
 static size_t lay_out(core *k, char *scratch, const ctmhe_stage *s, int slots, int np, int nb) {
@@ -151,7 +167,10 @@ static size_t lay_out(core *k, char *scratch, const ctmhe_stage *s, int slots, i
   k->barrier_spring = DOUBLES(&memory, k->nf);
   k->barrier_force = DOUBLES(&memory, 3 * k->nf); /* and the centring terms */
   k->lambda = DOUBLES(&memory, N * nx);
-  k->scratch_y = DOUBLES(&memory, nx + qy + (nx + qy) * n0 + n0 * n0);
+  const size_t lanes = s->jacobian.tape ? BATCH : 1;
+  k->lane = DOUBLES(&memory, lanes * (nx + qy + (nx + qy) * n0));
+  k->steps = DOUBLES(&memory, s->steps > 1 ? lanes * step_work_size(s, 1) : 0);
+  k->second = DOUBLES(&memory, curvature_work_size(s));
   lay_out_model(&k->a, &memory, N, nx, nw, all, qy, n, (size_t)nb);
   lay_out_model(&k->b, &memory, N, nx, nw, all, qy, n, (size_t)nb);
   k->kind_w = take(&memory, N);

@@ -2,38 +2,25 @@
 #ifndef CTMHE_MODEL_H
 #define CTMHE_MODEL_H
 
-#include "layout.h"
+#include "slot.h"
 
-/* Evaluate a stage function at slot k of a point; results come back as pointers. Returns nonzero on failure. */
-static int evaluate(const core *k, const ctmhe_function *f, const model *m, int slot, int results, double **out,
-                    const double *lambda_x, const double *lambda_y) {
+/* A slot at a point, for evaluation; the results go to one lane. */
+static slot_call slot_at(const core *k, const model *m, int slot, int lane, int derivatives) {
   const ctmhe_stage *s = k->s;
   const ctmhe_window *win = k->win;
   const size_t i = (size_t)slot, nx = (size_t)NX(s), nw = (size_t)NW(s), nu = (size_t)s->nu;
   const size_t qy = (size_t)(NQ(s) * NY(s)), n0 = nx + nw + (size_t)NP(s);
-  const double *arg[9] = {win->t + i,  win->h + i,       m->x + i * nx,    m->w + i * nw, m->p,
-                          win->u0 + i * nu, win->u1 + i * nu, lambda_x, lambda_y};
-  if (f->function) {
-    const double *given[CTMHE_MAX_ARGUMENTS];
-    double *taken[CTMHE_MAX_ARGUMENTS];
-    memcpy(given, arg, sizeof arg);
-    if (results == 1) {
-      out[0] = k->scratch_y + nx + qy + (nx + qy) * n0;
-    } else {
-      out[0] = k->scratch_y;
-      out[1] = out[0] + nx;
-      out[2] = out[1] + qy;
-    }
-    memcpy(taken, out, sizeof(double *) * (size_t)results);
-    return f->function(given, taken, f->iw, f->w, 0);
-  }
-  const size_t length[9] = {1, 1, nx, nw, (size_t)NP(s), nu, nu, nx, qy};
-  const int arguments = lambda_x ? 9 : 7;
-  for (int j = 0; j < arguments; j++)
-    for (size_t l = 0; l < length[j]; l++) f->arg[j][l] = arg[j][l];
-  for (int j = 0; j < results; j++) out[j] = f->res[j];
-  f->eval(f->self);
-  return f->failed && *f->failed;
+  double *to = k->lane + (size_t)lane * (nx + qy + (nx + qy) * n0);
+  const slot_call c = {win->t[i], win->h[i], m->x + i * nx, m->w + i * nw, m->p, win->u0 + i * nu, win->u1 + i * nu,
+                       to, to + nx, derivatives ? to + nx + qy : NULL};
+  return c;
+}
+
+/* Evaluate slots from `first` on, as many as there are lanes. Returns nonzero on failure. */
+static int evaluate(const core *k, const ctmhe_function *f, const model *m, int first, int lanes, int derivatives) {
+  slot_call calls[BATCH];
+  for (int l = 0; l < lanes; l++) calls[l] = slot_at(k, m, first + l, l, derivatives);
+  return evaluate_slots(k->s, f, calls, lanes, k->steps);
 }
 
 /* The rows of L_y J_y of one evaluation point, and the residual; returns the number of rows. */
@@ -87,13 +74,15 @@ INLINE int linearize_sized(core *k, model *m, int with_jacobian, int nx, int nw,
       r += win->L_prior[i * width + j] * ((j < nx ? m->x[j] : m->p[j - nx]) - win->prior[j]);
     cost += r * r;
   }
+  const int lanes = f->tape ? BATCH : 1, qy = q * ny, lane_size = nx + qy + (nx + qy) * (nx + nw + all);
   for (int slot = 0; slot < N; slot++) {
-    double *out[3] = {NULL, NULL, NULL};
-    if (evaluate(k, f, m, slot, with_jacobian ? 3 : 2, out, NULL, NULL)) return 1;
-    const double *next = m->x + (size_t)(slot + 1) * (size_t)nx, *y = out[1];
+    const int lane = slot % lanes;
+    if (lane == 0 && evaluate(k, f, m, slot, N - slot < lanes ? N - slot : lanes, with_jacobian)) return 1;
+    const double *reached = k->lane + lane * lane_size, *y = reached + nx, *jacobian = y + qy;
+    const double *next = m->x + (size_t)(slot + 1) * (size_t)nx;
     double *c = m->c + (size_t)slot * (size_t)nx;
     for (int i = 0; i < nx; i++) {
-      c[i] = (out[0][i] - next[i]) * k->inverse_x[i];
+      c[i] = (reached[i] - next[i]) * k->inverse_x[i];
       const double size = fabs(c[i]);
       infeasibility += size;
       if (size > defect) defect = size;
@@ -140,7 +129,7 @@ INLINE int linearize_sized(core *k, model *m, int with_jacobian, int nx, int nw,
     }
     for (int point = 0; point < q; point++) {
       if (k->kind_y[slot * q + point] == ZERO) continue;
-      const int used = weighted_rows(k, slot, point, y + point * ny, with_jacobian ? out[2] : NULL, k->rows,
+      const int used = weighted_rows(k, slot, point, y + point * ny, with_jacobian ? jacobian : NULL, k->rows,
                                      k->residual, nx, nw, np, all);
       for (int r = 0; r < used; r++) cost += k->residual[r] * k->residual[r];
       if (!with_jacobian) continue;
@@ -159,7 +148,7 @@ INLINE int linearize_sized(core *k, model *m, int with_jacobian, int nx, int nw,
     if (!with_jacobian) continue;
     double *restrict J = m->J + (size_t)slot * (size_t)((nx + nb) * n);
     for (int i = 0; i < nx; i++) {
-      const double *source = out[2] + i;
+      const double *source = jacobian + i;
       const double back = k->inverse_x[i];
       double *row = J + i * n;
       for (int j = 0; j < nw; j++) row[j] = source[(nx + j) * height] * back;
@@ -168,7 +157,7 @@ INLINE int linearize_sized(core *k, model *m, int with_jacobian, int nx, int nw,
       for (int j = 0; j < n; j++) row[j] *= k->scale[j];
     }
     for (int i = 0; i < nb; i++) {
-      const double *source = out[2] + nx + (q - 1) * ny + i;
+      const double *source = jacobian + nx + (q - 1) * ny + i;
       const double back = 1.0 / win->y_scale[i];
       double *row = J + (nx + i) * n;
       for (int j = 0; j < nw; j++) row[j] = source[(nx + j) * height] * back;
@@ -224,14 +213,14 @@ static int add_curvature(core *k, model *m) {
     }
     for (int i = 0; i < k->nb; i++)
       lambda_y[(q - 1) * ny + i] += k->z[k->fy + (size_t)(slot * k->nb + i)] / k->win->y_scale[i];
-    double *out[3] = {NULL, NULL, NULL};
-    if (evaluate(k, &s->curvature, m, slot, 1, out, lambda_x, lambda_y)) return 1;
+    const slot_call call = slot_at(k, m, slot, 0, 1);
+    if (slot_curvature(s, &call, lambda_x, lambda_y, k->second)) return 1;
     double *H = m->H + (size_t)slot * (size_t)(n * n);
     for (int i = 0; i < n; i++) {
       const int from = i < nw ? nx + i : i < nw + nx ? i - nw : i;
       for (int j = i; j < n; j++) {
         const int to = j < nw ? nx + j : j < nw + nx ? j - nw : j;
-        H[i * n + j] += out[0][from + to * n0] * k->scale[i] * k->scale[j];
+        H[i * n + j] += k->second[from + to * n0] * k->scale[i] * k->scale[j];
       }
     }
   }

@@ -3,7 +3,7 @@
 #ifndef CTMHE_UPDATE_H
 #define CTMHE_UPDATE_H
 
-#include "layout.h"
+#include "slot.h"
 
 typedef struct {
   const ctmhe_stage *s;
@@ -16,8 +16,8 @@ typedef struct {
   uint8_t *shared, *known;      /* known: (n, ny) output known at the slot's end */
   double *L_prior, *L_w, *L_y, *y_data, *count;
   double *x_lower, *x_upper, *w_lower, *w_upper, *y_lower, *y_upper;
-  double *cursor, *work;        /* next expiry of each sensor; one stage evaluation */
-  int *row;
+  double *cursor, *work, *input; /* next expiry of each sensor; one evaluation of a slot; an input */
+  int *row, *steps;             /* steps: of each slot */
   double *solve;                /* scratch of ctmhe_solve */
 } assembly;
 
@@ -39,8 +39,10 @@ static size_t lay_out_assembly(assembly *a, char *scratch, const ctmhe_stage *s,
   a->y_lower = DOUBLES(&memory, n * ny);
   a->y_upper = DOUBLES(&memory, n * ny);
   a->cursor = DOUBLES(&memory, ny + 1);
-  a->work = DOUBLES(&memory, nx + q * ny + 2 * (size_t)s->nu);
+  a->work = DOUBLES(&memory, nx + q * ny + step_work_size(s, 0));
+  a->input = DOUBLES(&memory, s->nu);
   a->row = take(&memory, sizeof(int) * (ny + 1));
+  a->steps = take(&memory, sizeof(int) * n);
   a->shared = take(&memory, n);
   a->known = take(&memory, n * ny + 1);
   a->solve = take(&memory, ctmhe_scratch_size(s, capacity));
@@ -87,7 +89,7 @@ static int mesh_edges(assembly *a, int *at_start) {
   const ctmhe_estimator *e = a->e;
   const ctmhe_request *r = a->r;
   const double start = r->start, end = r->end, interval = e->interval, tolerance = a->tolerance;
-  const int capacity = r->capacity, parts = e->parts;
+  const int capacity = r->capacity;
   int filled = 0;
 #define EDGE(t)                                        \
   do {                                                 \
@@ -106,9 +108,8 @@ static int mesh_edges(assembly *a, int *at_start) {
   }
   if (*at_start) EDGE(start);
   EDGE(start);
-  double k = floor(start / interval * parts);
-  const double last = ceil(end / interval * parts), low = start + tolerance, high = end - tolerance;
-  double cell = floor(k / parts), part = k - cell * parts, before = -HUGE_VAL;
+  double cell = floor(start / interval), before = -HUGE_VAL;
+  const double low = start + tolerance, high = end - tolerance;
   int i = 0, j = 0;
   for (int s = 0; s < NY(a->s); s++) {
     a->cursor[s] = HUGE_VAL;
@@ -119,10 +120,10 @@ static int mesh_edges(assembly *a, int *at_start) {
   }
   while (i < r->y_count && !(r->y_t[i] > low && speaks(a, i, 0))) i++;
   while (j < r->u_count && !(r->u_t[j] > low)) j++;
-  for (;;) { /* merge steps, samples, input switches and expiries */
-    const double step = k <= last ? cell * interval + part * (interval / parts) : HUGE_VAL;
+  for (;;) { /* merge cells, samples, input switches and expiries */
+    const double corner = cell * interval;
     const double sample = i < r->y_count ? r->y_t[i] : HUGE_VAL, input = j < r->u_count ? r->u_t[j] : HUGE_VAL;
-    double next = step < sample ? step : sample;
+    double next = corner < sample ? corner : sample;
     int from = -1;
     if (input < next) next = input;
     for (int s = 0; s < NY(a->s); s++)
@@ -134,10 +135,8 @@ static int mesh_edges(assembly *a, int *at_start) {
     }
     if (from >= 0) {
       next_expiry(a, from);
-    } else if (next == step) {
-      k += 1.0;
-      part += 1.0;
-      if (part >= parts) part = 0.0, cell += 1.0;
+    } else if (next == corner) {
+      cell += 1.0;
     } else if (next == sample) {
       do i++;
       while (i < r->y_count && !speaks(a, i, 0));
@@ -177,6 +176,7 @@ static int build_mesh(assembly *a) {
   int64_t cell = 0;
   for (int i = n - 1; i >= 0; i--) {
     a->h[i] = a->edge[i + 1] - a->edge[i];
+    a->steps[i] = steps_of(a->s, a->h[i]);
     const double at = (a->edge[i] + 0.5 * a->h[i]) / e->interval + 1e-9;
     const int64_t here = (int64_t)at - (at < (double)(int64_t)at); /* floor */
     a->shared[i] = (uint8_t)(!e->discrete && i + 1 < n && here == cell);
@@ -260,7 +260,7 @@ static int weigh(const assembly *a, double *L, const double *root, int diagonal,
 static void held_signal(assembly *a, int sensor) {
   const ctmhe_estimator *e = a->e;
   const ctmhe_request *r = a->r;
-  const int ny = NY(a->s), q = NQ(a->s);
+  const int ny = NY(a->s), q = NQ(a->s), inner = POINTS(a->s) - 1;
   int i = -1, next = 0; /* rows of the sample that holds, and of the one after it */
   while (next < r->y_count && r->y[next * ny + sensor] != r->y[next * ny + sensor]) next++;
   for (int k = 0; k < a->n; k++) {
@@ -275,8 +275,10 @@ static void held_signal(assembly *a, int sensor) {
     if (e->linear[sensor] && next < r->y_count && r->y_t[next] > r->y_t[i])
       slope = (r->y[next * ny + sensor] - value) / (r->y_t[next] - r->y_t[i]);
     double *data = a->y_data + (size_t)(k * q * ny + sensor);
+    const double length = a->h[k] / a->steps[k];
     for (int node = 0; node < q; node++) {
-      const double t = node < q - 1 ? start + a->h[k] * e->nodes[node] : end;
+      const int used = node < a->steps[k] * inner;
+      const double t = used ? start + (node / inner + e->nodes[node % inner]) * length : end;
       data[node * ny] = value + slope * (t - r->y_t[i]);
     }
     a->known[k * ny + sensor] = 1;
@@ -301,18 +303,21 @@ static int nearest_edge(const assembly *a, int from, int count, double t) {
 static int outputs(assembly *a) {
   const ctmhe_estimator *e = a->e;
   const ctmhe_request *r = a->r;
-  const int n = a->n, ny = NY(a->s), q = NQ(a->s);
+  const int n = a->n, ny = NY(a->s), q = NQ(a->s), inner = POINTS(a->s) - 1;
   for (int i = 0; i < n * q * ny; i++) a->y_data[i] = 0.0;
   for (int i = 0; i < n * ny; i++) a->count[i] = 0.0, a->known[i] = 0;
   for (int s = 0; s < ny; s++)
     if (e->held[s]) held_signal(a, s);
-  for (int k = 0; k < n; k++)
-    for (int node = 0; node < q - 1; node++) {
-      const double t = a->edge[k] + a->h[k] * e->nodes[node];
-      const double factor = sqrt(a->h[k] * e->shares[node] * exp(-e->rate * (r->end - t)));
-      if (weigh(a, a->L_y + (size_t)((k * q + node) * ny * ny), e->root_R, e->diagonal_R, a->known + k * ny, factor))
-        return 1;
+  for (int k = 0; k < n; k++) {
+    const double length = a->h[k] / a->steps[k];
+    double *L = a->L_y + (size_t)(k * q * ny * ny);
+    for (int node = 0; node < q - 1; node++, L += ny * ny) {
+      const int used = node < a->steps[k] * inner;
+      const double t = a->edge[k] + (node / inner + e->nodes[node % inner]) * length;
+      const double factor = used ? sqrt(length * e->shares[node % inner] * exp(-e->rate * (r->end - t))) : 0.0;
+      if (weigh(a, L, e->root_R, e->diagonal_R, a->known + k * ny, factor)) return 1;
     }
+  }
   FOR_ROWS_ON_EDGES(n + 1) {
     int slot = edge - 1;
     if (a->h[0] == 0.0 && slot < 0) slot = 0; /* a sample at the window's start has a slot of no length */
@@ -419,25 +424,9 @@ static int bounds(assembly *a) {
 /* One slot of the model without derivatives; x_next into `x`. Returns nonzero where that is not finite. */
 static int carry(const assembly *a, double t, double h, const double *from, const double *w, const double *p,
                  const double *u0, const double *u1, double *x) {
-  const ctmhe_function *f = &a->s->value;
-  const double *arg[9] = {&t, &h, from, w, p, u0, u1, NULL, NULL};
-  double *next = a->work;
-  if (f->function) {
-    const double *given[CTMHE_MAX_ARGUMENTS];
-    double *taken[CTMHE_MAX_ARGUMENTS];
-    memcpy(given, arg, sizeof arg);
-    taken[0] = next;
-    taken[1] = next + NX(a->s);
-    if (f->function(given, taken, f->iw, f->w, 0)) return 1;
-  } else {
-    const int length[7] = {1, 1, NX(a->s), NW(a->s), NP(a->s), a->s->nu, a->s->nu};
-    for (int j = 0; j < 7; j++)
-      for (int l = 0; l < length[j]; l++) f->arg[j][l] = arg[j][l];
-    f->eval(f->self);
-    if (f->failed && *f->failed) return 1;
-    next = f->res[0];
-  }
-  double finite = 0.0;
+  double *y = a->work, *next = y + NQ(a->s) * NY(a->s), finite = 0.0;
+  const slot_call c = {t, h, from, w, p, u0, u1, next, y, NULL};
+  if (evaluate_slots(a->s, &a->s->value, &c, 1, next + NX(a->s))) return 1;
   for (int i = 0; i < NX(a->s); i++) {
     finite += next[i] * 0.0;
     x[i] = next[i];
@@ -469,7 +458,7 @@ static int filtering_prior(const assembly *a, double *prior) {
     for (int i = 0; i < NX(a->s); i++) prior[i] = t == end ? x_end[i] : x[i];
     return 0;
   }
-  double *u = a->work + NX(a->s) + NQ(a->s) * NY(a->s);
+  double *u = a->input;
   for (int i = 0; i < a->s->nu; i++) u[i] = u0[i] + (u1[i] - u0[i]) * ((t - start) / (end - start));
   return carry(a, start, t - start, x, w, p, u0, u, prior);
 }
