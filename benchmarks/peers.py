@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -15,7 +16,7 @@ from ctmhe.types import Array, Outcome
 
 CONVERGED, ONE = "converged", "one-iteration"
 AGREEMENT = 1e-6  # relative: costs that differ by less are the same
-PROBE = 25  # windows on which an SQP method's tolerance is chosen
+PROBE = 25  # windows on which a method's tolerance is chosen
 
 
 class Unavailable(Exception):
@@ -46,8 +47,8 @@ class Tool(Protocol):
 class Ctmhe:
     """This library, called as a user calls it: the newest sample is given, then the estimate asked for."""
 
-    def __init__(self, problem: Problem, reference: Reference, mode: str, compiled: bool):
-        options: dict[str, Any] = {}
+    def __init__(self, problem: Problem, mode: str, compiled: bool, **tuned: float):
+        options: dict[str, Any] = dict(tuned)
         if accepts("compile"):
             options["compile"] = "auto" if compiled else "off"
         elif compiled:
@@ -58,14 +59,18 @@ class Ctmhe:
         if compiled and not getattr(self.mhe, "compiled", True):
             raise Unavailable("no C compiler was found")
         starter = build(problem, **{**options, "max_iterations": 50}) if mode == ONE else self.mhe
-        state, estimate = grow(starter, problem)
-        self.kept, self.pending, self.k = state, (state, estimate), 0
+        self.start = grow(starter, problem)
+        self.restart()
         if mode == ONE:
             self.update(1)
             if self.pending[1].status.outcome not in (Outcome.SOLVED, Outcome.ITERATION_LIMIT) or any(
                 "reference" in rung for rung in self.pending[1].status.rungs
             ):
                 raise Unavailable("max_iterations=1 is no real-time iteration here: the failure ladder goes on")
+
+    def restart(self) -> None:
+        """Go back to window 0."""
+        self.kept, self.pending, self.k = self.start[0], self.start, 0
 
     def update(self, k: int) -> Update:
         """Solve window k."""
@@ -406,7 +411,9 @@ def make_tool(name: str, problem: Problem, reference: Reference, mode: str, comp
         If it is not installed or cannot take the problem or the mode.
     """
     if name == "ctmhe":
-        return Ctmhe(problem, reference, mode, compiled)
+        if mode == ONE:
+            return Ctmhe(problem, mode, compiled)
+        return loosest(lambda tolerance: Ctmhe(problem, mode, compiled, tolerance=tolerance), reference, OURS)
     if compiled:
         raise Unavailable("compiled models are timed for ctmhe only")
     if name == "do-mpc":
@@ -419,14 +426,20 @@ def make_tool(name: str, problem: Problem, reference: Reference, mode: str, comp
     made = program(problem, augmented=recipe.augmented)
     if recipe.plugin != "sqpmethod" or mode == ONE:
         return Casadi(recipe, made, problem, reference, mode)
-    return loosest(recipe, made, problem, reference)
+    return loosest(
+        lambda tolerance: Casadi(recipe, made, problem, reference, CONVERGED, tol_du=tolerance), reference, THEIRS
+    )
 
 
-def loosest(recipe: Recipe, made: Program, problem: Problem, reference: Reference) -> Casadi:
-    """Return an SQP method with the loosest tolerance that reaches the reference's cost in the first windows."""
+OURS = (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)  # of the cost, relative
+THEIRS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)  # of the scaled stationarity
+
+
+def loosest(make: Callable[[float], Any], reference: Reference, tolerances: Sequence[float]) -> Any:
+    """Return a tool with the loosest tolerance that reaches the reference's cost in the first windows."""
     tool = None
-    for tolerance in (1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8):
-        tool = Casadi(recipe, made, problem, reference, CONVERGED, tol_du=tolerance)
+    for tolerance in tolerances:
+        tool = make(tolerance)
         costs = np.array([tool.update(k).cost for k in range(min(len(reference.costs), PROBE))])
         if (np.abs(costs / reference.costs[: len(costs)] - 1) < 0.3 * AGREEMENT).all():
             break

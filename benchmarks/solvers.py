@@ -1,7 +1,8 @@
 """Time every tool on every problem, interleaved in one run: `python -m benchmarks.solvers [--json FILE] [--quick]`.
 
-Per update the minimum over the repeats counts, of the whole call from Python; then the median and the 99th percentile
-over the updates. A tool has converged when it says so and its cost agrees with the reference's in every window.
+The tools take turns at every update. Per update the minimum over the repeats counts, of the whole call from Python;
+then the median and the 99th percentile over the updates. Methods with a tolerance (ours and SQP's) get the loosest that
+gives the common cost. A tool has converged when it says so and its cost agrees with the reference's in every window.
 """
 
 from __future__ import annotations
@@ -118,8 +119,8 @@ def race(problem: Problem, tools: Sequence[str], updates: int, repeats: int, lim
     try:
         for k in range(1, updates + 1):
             best: dict[int, float] = {}
-            for repeat in range(repeats):
-                for i, entry in enumerate(runners):
+            for i, entry in enumerate(runners):  # in turn; the repeats of one tool follow each other
+                for repeat in range(repeats):
                     if entry.run is None or (repeat and best.get(i, 0.0) > 1.0):
                         continue
                     best[i] = min(best.get(i, float("inf")), measure(entry, k, limit))

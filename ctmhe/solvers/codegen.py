@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 
 from ctmhe.errors import SolverError
-from ctmhe.solvers.compilers import Source, build_library, extra_flags, find_compiler
+from ctmhe.solvers.compilers import NATIVE, Source, build_library, extra_flags, find_compiler
 from ctmhe.transcription.stage import StageFunction
 
 logger = logging.getLogger(__name__)
@@ -94,23 +94,27 @@ def specialised_core(stage: StageFunction) -> Path | None:
     if compiler is None or not (CORE / "core.c").is_file():
         return None
     flags = SMALL if stage.nx < WIDE_FROM else WIDE_GNU if compiler.gnu else WIDE
+    native = NATIVE if "zig" not in compiler.identity else ()  # which zig takes without being told
     sizes = {"NX": stage.nx, "NW": stage.nw, "NP": stage.np, "NU": stage.nu, "NY": stage.ny, "NQ": stage.q}
-    digest = sha256(f"{core_digest()}{ca.CasadiMeta.version()}\n{flags, LARGE}\n".encode())
+    digest = sha256(f"{core_digest()}{ca.CasadiMeta.version()}\n{flags, native, LARGE}\n".encode())
     for name, function in functions.items():
         digest.update(f"{name}\n{function.serialize()}\n".encode())
 
     def sources() -> list[Source]:
         return [*_generate(functions), Source("core.c", (CORE / "core.c").read_text(), flags)]
 
-    return _compiled("stage", sources, digest.hexdigest(), {f"CTMHE_{name}": size for name, size in sizes.items()})
+    defines = {f"CTMHE_{name}": size for name, size in sizes.items()}
+    return _compiled("stage", sources, digest.hexdigest(), defines, native)
 
 
-def _compiled(name: str, sources: Any, identity: str, defines: dict[str, int] | None = None) -> Path | None:
+def _compiled(
+    name: str, sources: Any, identity: str, defines: dict[str, int] | None = None, flags: tuple[str, ...] = ()
+) -> Path | None:
     """Build a library, or return None; the reason is logged once, where it arises."""
     if find_compiler() is None:
         return None
     try:
-        return build_library(name, sources, identity=identity, defines=defines or {}, include=[CORE])
+        return build_library(name, sources, identity=identity, flags=flags, defines=defines or {}, include=[CORE])
     except SolverError:
         return None
 

@@ -6,6 +6,7 @@ import atexit
 import json
 import logging
 import os
+import platform
 import shlex
 import shutil
 import subprocess
@@ -31,10 +32,11 @@ TIMEOUT = 300.0  # seconds for one run of a compiler
 WINDOWS, MACOS = sys.platform == "win32", sys.platform == "darwin"
 SUFFIX = ".dll" if WINDOWS else ".so"
 
-# Results must not depend on the processor or on how the compiler contracts a*b + c; the instructions that every x86-64
-# has are within 12 percent of AVX2 at these sizes, so the build is not bound to this machine's.
+# Results must not depend on the processor or on how the compiler contracts a*b + c.
 FLAGS = ("-std=c99", "-O3", "-fno-math-errno", "-ffp-contract=off")
 SHARED = () if WINDOWS else ("-fPIC", "-fno-semantic-interposition")
+# for what stays on this machine: wider vectors, with the same results as long as nothing is contracted
+NATIVE = ("-march=native", "-mtune=generic") if platform.machine().lower() in ("x86_64", "amd64") else ()
 # each library binds its names to itself: many of them live in one process
 LINK = ("-Wl,--export-all-symbols",) if WINDOWS else ("-lm",) if MACOS else ("-lm", "-Wl,-Bsymbolic")
 
@@ -107,6 +109,15 @@ def _version_line(command: Sequence[str]) -> str | None:
 def extra_flags() -> tuple[str, ...]:
     """Return the compiler flags in `$CTMHE_CFLAGS`, which follow ours: sanitizers, -march=native."""
     return tuple(shlex.split(os.environ.get("CTMHE_CFLAGS", ""), posix=not WINDOWS))
+
+
+@cache
+def processor() -> str:
+    """Return what tells this machine's processor from others whose instructions may differ: folders are shared."""
+    with suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    return platform.processor()
 
 
 def _environment() -> dict[str, str]:
@@ -182,7 +193,7 @@ def build_library(
     flags = (*FLAGS, *SHARED, *flags, *macros)
     given = "" if callable(sources) else [(source.name, source.text, source.flags) for source in sources]
     content = json.dumps(
-        [FORMAT, sysconfig.get_platform(), compiler.identity, flags, extra_flags(), LINK, identity, given]
+        [FORMAT, sysconfig.get_platform(), processor(), compiler.identity, flags, extra_flags(), LINK, identity, given]
     )
     key = f"{name}-{sha256(content.encode()).hexdigest()[:32]}"
     root = cache_directory()

@@ -23,7 +23,8 @@ ONE = {
     "acos": ca.acos, "atan": ca.atan, "sinh": ca.sinh, "cosh": ca.cosh, "tanh": ca.tanh, "asinh": ca.asinh,
     "acosh": ca.acosh, "atanh": ca.atanh, "fabs": ca.fabs, "sign": ca.sign, "floor": ca.floor, "ceil": ca.ceil,
     "erf": ca.erf, "log1p": ca.log1p, "expm1": ca.expm1, "not": ca.logic_not, "neg": lambda a: -a,
-    "sq": lambda a: a * a,    "twice": lambda a: 2 * a, "inv": lambda a: 1 / a, "constpow": lambda a: a**2.7, "constant": lambda a: a - 1.25,
+    "sq": lambda a: a * a, "twice": lambda a: 2 * a, "inv": lambda a: 1 / a,
+    "constpow": lambda a: a**2.7, "constant": lambda a: a - 1.25,
 }  # fmt: skip
 TWO = {
     "add": lambda a, b: a + b, "sub": lambda a, b: a - b, "mul": lambda a, b: a * b, "div": lambda a, b: a / b,

@@ -45,6 +45,8 @@ static void prepare(core *k, const ctmhe_result *guess) {
   for (int i = 0; i < nw; i++) k->scale[i] = win->w_scale[i];
   for (int i = 0; i < nx; i++) k->scale[nw + i] = win->x_scale[i], k->inverse_x[i] = 1.0 / win->x_scale[i];
   for (int i = 0; i < np; i++) k->scale[nw + nx + i] = win->p_scale[i];
+  for (int i = 0; i < nx; i++)
+    for (int j = 0; j < k->n; j++) k->factor[i * k->n + j] = k->inverse_x[i] * k->scale[j];
   for (int i = 0; i < nx; i++) k->inverse[i] = 1.0 / win->x_scale[i];
   for (int i = 0; i < nw; i++) k->inverse[nx + i] = 1.0 / win->w_scale[i];
   for (int i = 0; i < nb; i++) k->inverse[nx + nw + i] = 1.0 / win->y_scale[i];
@@ -128,64 +130,6 @@ static void prepare(core *k, const ctmhe_result *guess) {
     k->d[at] = 0.0;
   }
   k->stiffness = 0.0;
-}
-
-/* Bounds relative to the point, scaled. */
-static void relative_bounds(core *k, const model *m) {
-  const int nx = NX(k->s), nw = NW(k->s), ny = NY(k->s), q = NQ(k->s), nb = k->nb, np = k->np, N = k->N;
-  for (int slot = 0; slot <= N; slot++)
-    for (int i = 0; i < nx; i++) {
-      const size_t at = (size_t)(slot * nx + i);
-      k->low[at] = (k->lower[at] - m->x[at]) * k->inverse[i];
-      k->high[at] = (k->upper[at] - m->x[at]) * k->inverse[i];
-    }
-  for (int slot = 0; slot < N; slot++) {
-    for (int i = 0; i < nw; i++) {
-      const size_t from = (size_t)(slot * nw + i), at = k->fw + from;
-      k->low[at] = (k->lower[at] - m->w[from]) * k->inverse[nx + i];
-      k->high[at] = (k->upper[at] - m->w[from]) * k->inverse[nx + i];
-    }
-    for (int i = 0; i < nb; i++) {
-      const size_t at = k->fy + (size_t)(slot * nb + i);
-      const double y = m->y[(size_t)((slot * q + q - 1) * ny + i)];
-      k->low[at] = (k->lower[at] - y) * k->inverse[nx + nw + i];
-      k->high[at] = (k->upper[at] - y) * k->inverse[nx + nw + i];
-    }
-  }
-  for (int i = 0; i < np; i++) {
-    const size_t at = k->fp + (size_t)i;
-    k->low[at] = (k->lower[at] - m->p[i]) * k->inverse[nx + nw + nb + i];
-    k->high[at] = (k->upper[at] - m->p[i]) * k->inverse[nx + nw + nb + i];
-  }
-}
-
-static double typical_curvature(const core *k, const model *m) {
-  const int n = k->n, nv = n - k->np;
-  double largest = 0.0;
-  for (int slot = 0; slot < k->N; slot++)
-    for (int i = 0; i < nv; i++) {
-      const double value = fabs(m->H[(size_t)slot * (size_t)(n * n) + (size_t)(i * n + i)]);
-      if (value > largest) largest = value;
-    }
-  for (int i = nv; i < n; i++) {
-    double total = 0.0;
-    for (int slot = 0; slot < k->N; slot++) total += m->H[(size_t)slot * (size_t)(n * n) + (size_t)(i * n + i)];
-    if (fabs(total) > largest) largest = fabs(total);
-  }
-  return largest > 0.0 ? largest : 1.0;
-}
-
-/* Springs against the information that outputs give about states; without any, against all weights. */
-static double spring_constant(const core *k, const model *m) {
-  const int n = k->n, nw = NW(k->s), nx = NX(k->s), width = nx + k->np;
-  double largest = 0.0;
-  for (int slot = 0; slot < k->N; slot++)
-    for (int i = 0; i < nx; i++) {
-      double value = m->H[(size_t)slot * (size_t)(n * n) + (size_t)((nw + i) * (n + 1))];
-      if (slot == 0) value -= k->P[i * (width + 1)];
-      if (value > largest) largest = value;
-    }
-  return STIFFNESS * (largest > 0.0 ? largest : typical_curvature(k, m));
 }
 
 static void move(const core *k, const model *from, model *to, double alpha) {
@@ -362,10 +306,7 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
       break;
     }
     iteration++;
-    if (k->bounded) {
-      relative_bounds(k, current);
-      if (k->stiffness == 0.0) k->stiffness = spring_constant(k, current);
-    }
+    k->relative = 0;
     int status = OK;
     if (newton) {
       if (add_curvature(k, current)) status = NOT_A_NUMBER;
@@ -412,7 +353,7 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
       break;
     }
     /* a full step is likely the last: it needs no new linearisation */
-    const int last = rate * gain <= enough(options, current->cost, data);
+    const int last = iteration == options->max_iterations || rate * gain <= enough(options, current->cost, data);
     double merit = -HUGE_VAL; /* the worst of the last few: curved dynamics would cut good full steps */
     for (int i = 0; i < remembered; i++) {
       const double past = recent_cost[i] / 2 + rho * recent_infeasibility[i];
@@ -472,7 +413,7 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
         break;
       }
     }
-    if (!linearized && linearize(k, current)) return result->stop;
+    if (!linearized && iteration < options->max_iterations && linearize(k, current)) return result->stop;
   }
   result->iterations = iteration;
   hand_over(k, current, result, stepped);

@@ -68,6 +68,7 @@ typedef struct {
   size_t nf;               /* flat vectors: x (N+1, nx), w (N, nw), y (N, nb), p (np) */
   size_t fw, fy, fp;       /* where w, y, p start in them */
   double *scale, *inverse_x; /* (n) of v; 1 / x_scale */
+  double *factor;          /* (nx, n) what scales the Jacobian of a step: scale / x_scale */
   double *W, *P;           /* scaled weights of w (N, nw, nw) and of the prior (m, m) */
   uint8_t *kind_w, *kind_y;
   double *rows;            /* (q ny, n) weighted output rows of one slot */
@@ -81,6 +82,8 @@ typedef struct {
   double *z_low, *z_high, *s_low, *s_high, *start; /* flat: interior point multipliers, slacks, last step */
   double *barrier_spring, *barrier_force;          /* flat */
   int barrier;             /* the interior point method is at work */
+  int calm;                /* nothing is held, pushed or damped */
+  int relative;            /* `low` and `high` belong to the point */
   double *lambda;          /* (N, nx) */
   int8_t *active, *candidate, *cautious, *kept;
   uint8_t *fixed;
@@ -139,6 +142,7 @@ static size_t lay_out(core *k, char *scratch, const ctmhe_stage *s, int slots, i
   k->nf = k->fp + (size_t)np;
   k->scale = DOUBLES(&memory, n);
   k->inverse_x = DOUBLES(&memory, nx);
+  k->factor = DOUBLES(&memory, nx * n);
   k->inverse = DOUBLES(&memory, nx + nw + (size_t)nb + (size_t)np);
   k->W = DOUBLES(&memory, N * nw * nw);
   k->P = DOUBLES(&memory, (nx + (size_t)np) * (nx + (size_t)np));

@@ -5,7 +5,7 @@
 #include "slot.h"
 
 /* A slot at a point, for evaluation; the results go to one lane. */
-static slot_call slot_at(const core *k, const model *m, int slot, int lane, int derivatives) {
+INLINE slot_call slot_at(const core *k, const model *m, int slot, int lane, int derivatives) {
   const ctmhe_stage *s = k->s;
   const ctmhe_window *win = k->win;
   const size_t i = (size_t)slot, nx = (size_t)NX(s), nw = (size_t)NW(s), nu = (size_t)s->nu;
@@ -21,6 +21,17 @@ static int evaluate(const core *k, const ctmhe_function *f, const model *m, int 
   slot_call calls[BATCH];
   for (int l = 0; l < lanes; l++) calls[l] = slot_at(k, m, first + l, l, derivatives);
   return evaluate_slots(k->s, f, calls, lanes, k->steps);
+}
+
+/* The same for one slot of one step by a compiled function, without detours. */
+INLINE int evaluate_directly(const core *k, const ctmhe_function *f, const model *m, int slot, int derivatives) {
+  const slot_call c = slot_at(k, m, slot, 0, derivatives);
+  const double *given[CTMHE_MAX_ARGUMENTS];
+  double *taken[CTMHE_MAX_ARGUMENTS];
+  given[0] = k->win->t + slot, given[1] = k->win->h + slot, given[2] = c.x, given[3] = c.w, given[4] = c.p;
+  given[5] = c.u0, given[6] = c.u1;
+  taken[0] = c.x_next, taken[1] = c.y, taken[2] = c.J;
+  return f->function(given, taken, f->iw, f->w, 0);
 }
 
 /* The rows of L_y J_y of one evaluation point, and the residual; returns the number of rows. */
@@ -75,9 +86,14 @@ INLINE int linearize_sized(core *k, model *m, int with_jacobian, int nx, int nw,
     cost += r * r;
   }
   const int lanes = f->tape ? BATCH : 1, qy = q * ny, lane_size = nx + qy + (nx + qy) * (nx + nw + all);
+  const int direct = f->function && s->steps == 1;
   for (int slot = 0; slot < N; slot++) {
     const int lane = slot % lanes;
-    if (lane == 0 && evaluate(k, f, m, slot, N - slot < lanes ? N - slot : lanes, with_jacobian)) return 1;
+    if (direct) {
+      if (evaluate_directly(k, f, m, slot, with_jacobian)) return 1;
+    } else if (lane == 0) {
+      if (evaluate(k, f, m, slot, N - slot < lanes ? N - slot : lanes, with_jacobian)) return 1;
+    }
     const double *reached = k->lane + lane * lane_size, *y = reached + nx, *jacobian = y + qy;
     const double *next = m->x + (size_t)(slot + 1) * (size_t)nx;
     double *c = m->c + (size_t)slot * (size_t)nx;
@@ -110,7 +126,7 @@ INLINE int linearize_sized(core *k, model *m, int with_jacobian, int nx, int nw,
       memset(H, 0, sizeof(double) * (size_t)(n * n));
       memset(g, 0, sizeof(double) * (size_t)n);
     }
-    for (int i = 0; i < nw; i++) scaled_w[i] = w[i] / k->scale[i];
+    for (int i = 0; i < nw; i++) scaled_w[i] = w[i] * k->inverse[nx + i];
     const int dense_w = k->kind_w[slot] == DENSE;
     for (int i = 0; i < nw; i++) {
       double force = 0.0;
@@ -148,13 +164,11 @@ INLINE int linearize_sized(core *k, model *m, int with_jacobian, int nx, int nw,
     if (!with_jacobian) continue;
     double *restrict J = m->J + (size_t)slot * (size_t)((nx + nb) * n);
     for (int i = 0; i < nx; i++) {
-      const double *source = jacobian + i;
-      const double back = k->inverse_x[i];
+      const double *source = jacobian + i, *factor = k->factor + i * n;
       double *row = J + i * n;
-      for (int j = 0; j < nw; j++) row[j] = source[(nx + j) * height] * back;
-      for (int j = 0; j < nx; j++) row[nw + j] = source[j * height] * back;
-      for (int j = 0; j < np; j++) row[nw + nx + j] = source[(nx + nw + j) * height] * back;
-      for (int j = 0; j < n; j++) row[j] *= k->scale[j];
+      for (int j = 0; j < nw; j++) row[j] = source[(nx + j) * height] * factor[j];
+      for (int j = 0; j < nx; j++) row[nw + j] = source[j * height] * factor[nw + j];
+      for (int j = 0; j < np; j++) row[nw + nx + j] = source[(nx + nw + j) * height] * factor[nw + nx + j];
     }
     for (int i = 0; i < nb; i++) {
       const double *source = jacobian + nx + (q - 1) * ny + i;

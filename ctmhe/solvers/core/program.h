@@ -4,6 +4,91 @@
 
 #include "riccati.h"
 
+/* Bounds relative to the point, scaled. */
+static void relative_bounds(core *k, const model *m) {
+  if (k->relative) return;
+  k->relative = 1;
+  const int nx = NX(k->s), nw = NW(k->s), ny = NY(k->s), q = NQ(k->s), nb = k->nb, np = k->np, N = k->N;
+  for (int slot = 0; slot <= N; slot++)
+    for (int i = 0; i < nx; i++) {
+      const size_t at = (size_t)(slot * nx + i);
+      k->low[at] = (k->lower[at] - m->x[at]) * k->inverse[i];
+      k->high[at] = (k->upper[at] - m->x[at]) * k->inverse[i];
+    }
+  for (int slot = 0; slot < N; slot++) {
+    for (int i = 0; i < nw; i++) {
+      const size_t from = (size_t)(slot * nw + i), at = k->fw + from;
+      k->low[at] = (k->lower[at] - m->w[from]) * k->inverse[nx + i];
+      k->high[at] = (k->upper[at] - m->w[from]) * k->inverse[nx + i];
+    }
+    for (int i = 0; i < nb; i++) {
+      const size_t at = k->fy + (size_t)(slot * nb + i);
+      const double y = m->y[(size_t)((slot * q + q - 1) * ny + i)];
+      k->low[at] = (k->lower[at] - y) * k->inverse[nx + nw + i];
+      k->high[at] = (k->upper[at] - y) * k->inverse[nx + nw + i];
+    }
+  }
+  for (int i = 0; i < np; i++) {
+    const size_t at = k->fp + (size_t)i;
+    k->low[at] = (k->lower[at] - m->p[i]) * k->inverse[nx + nw + nb + i];
+    k->high[at] = (k->upper[at] - m->p[i]) * k->inverse[nx + nw + nb + i];
+  }
+}
+
+static double typical_curvature(const core *k, const model *m) {
+  const int n = k->n, nv = n - k->np;
+  double largest = 0.0;
+  for (int slot = 0; slot < k->N; slot++)
+    for (int i = 0; i < nv; i++) {
+      const double value = fabs(m->H[(size_t)slot * (size_t)(n * n) + (size_t)(i * n + i)]);
+      if (value > largest) largest = value;
+    }
+  for (int i = nv; i < n; i++) {
+    double total = 0.0;
+    for (int slot = 0; slot < k->N; slot++) total += m->H[(size_t)slot * (size_t)(n * n) + (size_t)(i * n + i)];
+    if (fabs(total) > largest) largest = fabs(total);
+  }
+  return largest > 0.0 ? largest : 1.0;
+}
+
+/* Springs against the information that outputs give about states; without any, against all weights. */
+static double spring_constant(const core *k, const model *m) {
+  const int n = k->n, nw = NW(k->s), nx = NX(k->s), width = nx + k->np;
+  double largest = 0.0;
+  for (int slot = 0; slot < k->N; slot++)
+    for (int i = 0; i < nx; i++) {
+      double value = m->H[(size_t)slot * (size_t)(n * n) + (size_t)((nw + i) * (n + 1))];
+      if (slot == 0) value -= k->P[i * (width + 1)];
+      if (value > largest) largest = value;
+    }
+  return STIFFNESS * (largest > 0.0 ? largest : typical_curvature(k, m));
+}
+
+/* Whether a step breaks a bound; none is held. */
+static int breaks_bound(const core *k, const model *m) {
+  const int nx = NX(k->s), nw = NW(k->s), ny = NY(k->s), q = NQ(k->s), nb = k->nb, np = k->np, N = k->N;
+  const double *d = k->d, *lower = k->lower, *upper = k->upper, limit = 1e-10;
+  double worst = 0.0;
+#define BREAKS(at, value, inverse)                                                                      \
+  do {                                                                                                  \
+    const double low = (lower[at] - (value)) * (inverse) - d[at], high = d[at] - (upper[at] - (value)) * (inverse); \
+    worst = low > worst ? low : worst;                                                                  \
+    worst = high > worst ? high : worst;                                                                \
+  } while (0)
+  for (int slot = 0; slot <= N; slot++)
+    for (int i = 0; i < nx; i++) BREAKS(slot * nx + i, m->x[slot * nx + i], k->inverse[i]);
+  d += k->fw, lower += k->fw, upper += k->fw;
+  for (int slot = 0; slot < N; slot++)
+    for (int i = 0; i < nw; i++) BREAKS(slot * nw + i, m->w[slot * nw + i], k->inverse[nx + i]);
+  d += k->fy - k->fw, lower += k->fy - k->fw, upper += k->fy - k->fw;
+  for (int slot = 0; slot < N; slot++)
+    for (int i = 0; i < nb; i++) BREAKS(slot * nb + i, m->y[(slot * q + q - 1) * ny + i], k->inverse[nx + nw + i]);
+  d += k->fp - k->fy, lower += k->fp - k->fy, upper += k->fp - k->fy;
+  for (int i = 0; i < np; i++) BREAKS(i, m->p[i], k->inverse[nx + nw + nb + i]);
+#undef BREAKS
+  return worst > limit;
+}
+
 /* Whether a held bound is a spring (else it is substituted). */
 static int sprung(const core *k, size_t at) {
   return (at >= (size_t)NX(k->s) && at < k->fw) || (at >= k->fy && at < k->fp);
@@ -19,11 +104,16 @@ static int slot_of(const core *k, size_t at) {
 /* Minimise with the held bounds; slots behind `from` still have their factors. */
 static int equality_constrained(core *k, const model *m, int from) {
   const size_t nx = (size_t)NX(k->s);
+  k->calm = !(k->barrier || k->damping > 0.0 || any_held(k));
+  if (!k->calm && k->bounded) {
+    relative_bounds(k, m);
+    if (k->stiffness == 0.0) k->stiffness = spring_constant(k, m);
+  }
   for (int attempt = 0; attempt < 4; attempt++) {
     int status = backward(k, m, from, 0);
     if (status) return status;
     forward(k, m, 0);
-    if (!k->bounded) {
+    if (k->calm || !k->bounded) {
       adjoint(k, m);
       return k->stationarity == k->stationarity ? OK : NOT_A_NUMBER;
     }
@@ -152,13 +242,13 @@ static double step_to_boundary(const core *k, double *complementarity, double al
   return alpha;
 }
 
-static double spring_constant(const core *k, const model *m);
-
 /* Mehrotra's predictor-corrector on all bounds that are not equalities; leaves the active set it finds. */
 static int interior_point(core *k, const model *m, int *factorizations) {
   const size_t nf = k->nf;
   double *centre_high = k->barrier_force + nf, *centre_low = centre_high + nf;
   const double curvature = spring_constant(k, m) / STIFFNESS;
+  relative_bounds(k, m);
+  k->calm = 0;
   k->stiffness = STIFFNESS * curvature;
   for (size_t at = 0; at < nf; at++) {
     k->active[at] = k->fixed[at] ? 1 : 0;
@@ -297,6 +387,10 @@ static int active_set(core *k, const model *m, int *factorizations) {
       for (size_t at = 0; at < k->nf; at++) k->z[at] = 0.0;
       from = k->N;
       continue;
+    }
+    if (k->calm) {
+      if (!breaks_bound(k, m)) return OK;
+      relative_bounds(k, m);
     }
     if (!update(k)) return OK;
     const uint64_t key = hash(k->candidate, k->nf);

@@ -193,18 +193,23 @@ INLINE int backward_sized(core *k, const model *m, int from, int right_hand_side
 
 /* Whether any bound is held. */
 static int any_held(const core *k) {
-  for (size_t at = 0; at < k->nf && k->bounded; at++)
-    if (k->active[at]) return 1;
-  return 0;
+  uint64_t word, any = 0;
+  size_t at = 0;
+  if (!k->bounded) return 0;
+  for (; at + sizeof word <= k->nf; at += sizeof word) {
+    memcpy(&word, k->active + at, sizeof word);
+    any |= word;
+  }
+  for (; at < k->nf; at++) any |= (uint64_t)(k->active[at] != 0);
+  return any != 0;
 }
 
 static int backward(core *k, const model *m, int from, int right_hand_side) {
   const int nx = NX(k->s), nw = NW(k->s), np = NP(k->s);
   if (right_hand_side) return np && k->np ? backward_sized(k, m, from, 1, 0, nx, nw, np)
                                           : backward_sized(k, m, from, 1, 0, nx, nw, 0);
-  if (k->barrier || k->damping > 0.0 || any_held(k))
-    return np && k->np ? backward_sized(k, m, from, 0, 0, nx, nw, np) : backward_sized(k, m, from, 0, 0, nx, nw, 0);
-  return np && k->np ? backward_sized(k, m, from, 0, 1, nx, nw, np) : backward_sized(k, m, from, 0, 1, nx, nw, 0);
+  if (k->calm) return np && k->np ? backward_sized(k, m, from, 0, 1, nx, nw, np) : backward_sized(k, m, from, 0, 1, nx, nw, 0);
+  return np && k->np ? backward_sized(k, m, from, 0, 0, nx, nw, np) : backward_sized(k, m, from, 0, 0, nx, nw, 0);
 }
 
 /* Solve for `count` leading variables of v, those behind them known. */
@@ -227,7 +232,7 @@ INLINE void forward_sized(core *k, const model *m, int correction, int nx, int n
     const int first = slot == 0 || !shared[slot - 1];
     const int eliminated = slot == 0 ? n : first ? nw : 0;
     back_substitute(v, U, D, q, eliminated, n);
-    if (k->bounded && eliminated && !correction)
+    if (!k->calm && k->bounded && eliminated && !correction)
       for (int j = 0; j < eliminated; j++) {
         const size_t at = j < nw ? k->fw + (size_t)(slot * nw + j)
                                  : j < nw + nx ? (size_t)(j - nw) : k->fp + (size_t)(j - nw - nx);
@@ -272,6 +277,7 @@ static void forward(core *k, const model *m, int correction) {
 INLINE void adjoint_sized(core *k, const model *m, int nx, int nw, int np) {
   const int n = nw + nx + np, N = k->N, nb = k->nb;
   const uint8_t *shared = k->win->shared;
+  const int held = k->bounded && !k->calm;
   double *restrict v = k->v, *restrict r = k->r, *restrict Hv = k->t;
   double *rw = k->S, *rp = k->S + nw, *Hp = k->S + nw + np, *gp = k->S + nw + 2 * np;
   const double *d = k->d;
@@ -282,7 +288,7 @@ INLINE void adjoint_sized(core *k, const model *m, int nx, int nw, int np) {
     Hp[i] = gp[i] = 0.0;
   }
   for (int i = 0; i < nx; i++)
-    k->lambda[(N - 1) * nx + i] = k->damping * d[N * nx + i] + (k->bounded ? k->z[N * nx + i] : 0.0);
+    k->lambda[(N - 1) * nx + i] = k->damping * d[N * nx + i] + (held ? k->z[N * nx + i] : 0.0);
   for (int slot = N - 1; slot >= 0; slot--) {
     const double *H = m->H + (size_t)slot * (size_t)(n * n), *g = m->g + (size_t)(slot * n);
     const double *J = m->J + (size_t)(slot * (nx + nb)) * (size_t)n, *lambda = k->lambda + (size_t)(slot * nx);
@@ -322,7 +328,7 @@ INLINE void adjoint_sized(core *k, const model *m, int nx, int nw, int np) {
     if (slot == 0 || !shared[slot - 1]) {
       for (int i = 0; i < nw; i++) {
         const size_t at = k->fw + (size_t)(slot * nw + i);
-        if (k->bounded && k->active[at]) k->z[at] = -rw[i];
+        if (held && k->active[at]) k->z[at] = -rw[i];
         else if (fabs(rw[i]) > residual) residual = fabs(rw[i]);
         r[i] = rw[i];
         rw[i] = 0.0;
@@ -333,12 +339,12 @@ INLINE void adjoint_sized(core *k, const model *m, int nx, int nw, int np) {
     for (int i = 0; i < np; i++) rp[i] += r[nw + nx + i];
     if (slot == 0) {
       for (int i = 0; i < nx; i++) {
-        if (k->bounded && k->active[i]) k->z[i] = -r[nw + i];
+        if (held && k->active[i]) k->z[i] = -r[nw + i];
         else if (fabs(r[nw + i]) > residual) residual = fabs(r[nw + i]);
       }
     } else {
       double *before = k->lambda + (size_t)((slot - 1) * nx);
-      if (k->bounded)
+      if (held)
         for (int i = 0; i < nx; i++) before[i] = r[nw + i] + k->z[slot * nx + i];
       else
         for (int i = 0; i < nx; i++) before[i] = r[nw + i];
@@ -346,7 +352,7 @@ INLINE void adjoint_sized(core *k, const model *m, int nx, int nw, int np) {
   }
   for (int i = 0; i < np; i++) {
     const size_t at = k->fp + (size_t)i;
-    if (k->bounded && k->active[at]) k->z[at] = -rp[i];
+    if (held && k->active[at]) k->z[at] = -rp[i];
     else if (fabs(rp[i]) > residual) residual = fabs(rp[i]);
     if (fabs(gp[i]) > largest) largest = fabs(gp[i]);
     if (fabs(Hp[i]) > product) product = fabs(Hp[i]);
