@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ctmhe.errors import InputError
-from ctmhe.types import Array, frozen
+from ctmhe.types import Array, address, frozen
 
 SMALLEST = 64  # rows for which a log has room at least
 FEW = 8  # rows that are looked at one by one before a search
@@ -25,9 +25,12 @@ class _Shared:
 
     def __init__(self, times: Array, rows: Array, capacity: int):
         """Copy times (n,) and rows (n, width) to where `capacity` of them have room."""
-        self.times, self.rows, self.count = np.empty(capacity), np.empty((capacity, rows.shape[1])), len(times)
+        self.count, width = rows.shape
+        block = np.empty(capacity * (1 + width))
+        self.times, self.rows = block[:capacity], block[capacity:].reshape(capacity, width)
         self.times[: self.count], self.rows[: self.count] = times, rows
-        self.addresses = (self.times.ctypes.data, self.rows.ctypes.data)
+        start = address(block)
+        self.addresses = (start, start + 8 * capacity)
         self.lock = Lock()
 
 
@@ -96,7 +99,9 @@ class Log:
     def put(self, t: float, row: Array) -> Log:
         """Return a log that also holds `row` at `t`, in place of a row at exactly the same time."""
         if t > self.last_time:
-            return self._append(t, row, 1)
+            shared, start, stop = self._room(1)
+            shared.times[stop], shared.rows[stop] = t, row
+            return Log(self.width, shared, start, stop + 1)
         i = self._position(t)
         behind = i + 1 if i < self._stop and self._shared.times[i] == t else i
         times, rows = self._shared.times, self._shared.rows
@@ -109,9 +114,15 @@ class Log:
 
     def extend(self, times: Array, rows: Array) -> Log:
         """Return a log with ordered rows (n, width) appended, none of them before the last one."""
-        return self._append(times, rows, len(times)) if len(times) else self
+        count = len(times)
+        if not count:
+            return self
+        shared, start, stop = self._room(count)
+        shared.times[stop : stop + count], shared.rows[stop : stop + count] = times, rows
+        return Log(self.width, shared, start, stop + count)
 
-    def _append(self, times: Any, rows: Array, count: int) -> Log:
+    def _room(self, count: int) -> tuple[_Shared, int, int]:
+        """Return storage with room for `count` rows behind those of this log, and where they start and stop in it."""
         shared, start, stop = self._shared, self._start, self._stop
         with shared.lock:
             fits = stop == shared.count and stop + count <= len(shared.times)
@@ -123,9 +134,7 @@ class Log:
             shared = _Shared(shared.times[live], shared.rows[live], capacity)
             start, stop = 0, shared.count
             shared.count += count
-        shared.times[stop : stop + count] = times
-        shared.rows[stop : stop + count] = rows
-        return Log(self.width, shared, start, stop + count)
+        return shared, start, stop
 
     def _position(self, t: float, side: Literal["left", "right"] = "left") -> int:
         return self._start + int(self._shared.times[self._start : self._stop].searchsorted(t, side))

@@ -281,10 +281,12 @@ class MHE:
         state = _checked(state, self)
         if not isinstance(measurement, Measurement):
             raise InputError(f"observe expects a Measurement(t, y), got {type(measurement).__name__}")
-        t = measurement.t
-        row = self.model.y.vector(measurement.y, f"measurement at t = {t:g}", missing=np.nan, allow_nan=True)
+        t, row = measurement.t, measurement.y
+        complete = self.model.y.complete(row)
+        if not complete:
+            row = self.model.y.vector(row, f"measurement at t = {t:g}", missing=np.nan, allow_nan=True)
         self._check_age(state, t, "measurement")
-        if row is not measurement.y and not np.isfinite(row).any():
+        if not complete and not np.isfinite(row).any():
             return state
         self._check_step(t, "measurement")
         known = state.measurements.find(t)
@@ -305,7 +307,9 @@ class MHE:
         state = _checked(state, self)
         if not isinstance(value, Input):
             raise InputError(f"control expects an Input(t, u), got {type(value).__name__}")
-        u = self.model.u.vector(value.u, f"input at t = {value.t:g}")
+        u = value.u
+        if not self.model.u.complete(u):
+            u = self.model.u.vector(u, f"input at t = {value.t:g}")
         if state.solves:
             self._check_age(state, value.t, "input")
         return state.knowing(state.measurements, state.inputs.put(value.t, u))
@@ -315,9 +319,11 @@ class MHE:
         return same_time(self.interval, t)
 
     def _check_age(self, state: State, t: float, what: str) -> None:
+        edge = state.t - self.horizon
+        if t >= state.t0 and t >= edge:
+            return
         if t < state.t0 - self._slack(t):
             raise TooLate(f"{what} at t = {t:g} s is older than the start of estimation at {state.t0:g} s")
-        edge = state.t - self.horizon
         if t < edge - self._slack(t):
             raise TooLate(
                 f"{what} at t = {t:g} s is older than the window, which starts at {edge:g} s; a longer horizon "
@@ -367,12 +373,8 @@ class MHE:
             known, times = (state.start, state.p), (state.t, since)
             update = self._updates.run(*self._span(state, t), *logs, state.window, known, times)
             if update is not None:
-                notes = () if update.measured else ("no measurement in window",)
-                found = update.outcome
-                reached = (update.iterations, update.optimality, update.feasibility)
-                status = Status(found, found is Outcome.SOLVED, *reached, 0.0, (), notes, update.factorizations)
                 added = (update.path_times, update.path_rows)
-                return self._conclude(state, t, since, update.solved, added, update.cost, status, began)
+                return self._conclude(state, t, since, update.solved, added, update.cost, update.status, began)
         window, notes = self._window(state, t)
         guesses = starting_points(self.stage, state, window)
         rungs = (window, self._solver, lambda: self._reference, guesses, notes)

@@ -109,7 +109,7 @@ def load_state(path: str | Path, fingerprint: dict[str, Any], layout: Layout) ->
             )
     window = None
     if header["slots"] is not None:
-        window = Solved.closed(layout, header["slots"], arrays["window_values"], arrays["window_active"])
+        window = Solved.copied(layout, header["slots"], arrays["window_values"], arrays["window_active"])
     logs = {name: Log.of(arrays[f"{name}_t"], rows := arrays[f"{name}_rows"], rows.shape[1]) for name in LOGS}
     return State(
         t0=header["t0"],
