@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
 from math import isfinite
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,6 +17,7 @@ from ctmhe.errors import InputError
 
 Array = np.ndarray[Any, Any]
 Values = ArrayLike | Mapping[str, float]
+T = TypeVar("T")
 
 
 def frozen(values: Any) -> Array:
@@ -27,8 +28,18 @@ def frozen(values: Any) -> Array:
 
 
 def address(array: Array) -> int:
-    """Return where the memory of an array that is not empty begins: `array.ctypes.data`, at a third of its cost."""
-    return addressof(c_char.from_buffer(array)) if array.flags.writeable else array.ctypes.data
+    """Return where the memory of a writeable array begins: `array.ctypes.data`, at half the cost."""
+    return addressof(c_char.from_buffer(array))
+
+
+def made(kind: type[T], fields: dict[str, Any]) -> T:
+    """Return a value of a frozen dataclass from the dictionary of all its fields, which it takes over.
+
+    Where an estimate is a matter of microseconds: `__init__` sets one field after the other, at twice the cost.
+    """
+    value = object.__new__(kind)
+    object.__setattr__(value, "__dict__", fields)
+    return value
 
 
 def positive(what: str, value: Any, unit: str = "") -> float:

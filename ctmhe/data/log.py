@@ -112,14 +112,16 @@ class Log:
             self.width,
         )
 
-    def extend(self, times: Array, rows: Array) -> Log:
-        """Return a log with ordered rows (n, width) appended, none of them before the last one."""
+    def extend(self, times: Array, rows: Array, *, since: float = -inf) -> Log:
+        """Return a log with ordered rows (n, width) appended, none of them before the last one, and without rows older
+        than `since`.
+        """
         count = len(times)
         if not count:
-            return self
+            return self.drop_before(since)
         shared, start, stop = self._room(count)
         shared.times[stop : stop + count], shared.rows[stop : stop + count] = times, rows
-        return Log(self.width, shared, start, stop + count)
+        return Log(self.width, shared, start, stop + count).drop_before(since)
 
     def _room(self, count: int) -> tuple[_Shared, int, int]:
         """Return storage with room for `count` rows behind those of this log, and where they start and stop in it."""

@@ -42,6 +42,7 @@ from ctmhe.types import (
     Status,
     finite_time,
     frozen,
+    made,
     positive,
 )
 
@@ -465,28 +466,29 @@ class MHE:
         path = state.path if t > state.t else state.path.drop_after(since)
         held = self.hold_limit if self._holds else 0.0
         inputs = state.inputs
-        new = State(
-            state.t0,
-            t,
-            state.start,
-            x,
-            p,
-            state.measurements.drop_before(edge - held - slack),
-            inputs.drop_before(edge - slack, keep_holding=True) if len(inputs) else inputs,
-            path.extend(*added).drop_before(edge - slack),
-            since,
-            solved,
-            state.solves + 1,
-        )
+        fields = {
+            "t": t,
+            "x": x,
+            "p": p,
+            "measurements": state.measurements.drop_before(edge - held - slack),
+            "inputs": inputs.drop_before(edge - slack, keep_holding=True) if len(inputs) else inputs,
+            "path": path.extend(*added, since=edge - slack),
+            "since": since,
+            "window": solved,
+            "solves": state.solves + 1,
+        }
+        new = made(State, state.__dict__ | fields)
 
         def covariance() -> tuple[Array, int]:
             window, _ = self._window(state, t)
             values, rank = self._covariance(window, solved.guess)
             return frozen(values), rank
 
-        seconds = self.clock() - began
         known = None if status.outcome is Outcome.PREDICTED else covariance
-        return new, Estimate(t, x, p, w, y, cost, status, solved, seconds, known)
+        seconds = self.clock() - began
+        fields = {"t": t, "x": x, "p": p, "w": w, "y": y, "cost": cost, "status": status, "_solved": solved,
+                  "seconds": seconds, "_covariance": known}  # fmt: skip
+        return new, made(Estimate, fields)
 
     def propagate(self, state: State, t0: float, t1: float, x: Array, p: Array) -> Array:
         """Return the state at `t1` from `x` (nx,) at `t0`, without disturbance, under the inputs that `state` knows.

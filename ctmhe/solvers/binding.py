@@ -122,8 +122,8 @@ class RequestHeader(ctypes.Structure):
 
 # One call for the fields that change from update to update: a field of a structure costs as much as five of them here.
 REQUESTED = Struct("4d 6i 8P")  # the request from `start` to `p`
-WRITTEN = Struct("3i")  # the request from `n` on
-REACHED = Struct("3d 3i")  # the result from `cost` on
+WRITTEN, WRITTEN_AT = Struct("3i"), RequestHeader.n.offset  # the request from `n` on
+REACHED, REACHED_AT = Struct("3d 3i"), ResultHeader.cost.offset  # the result from `cost` on
 
 
 class Functions:

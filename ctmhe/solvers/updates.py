@@ -13,8 +13,10 @@ from ctmhe.solvers.binding import (
     CONSTANTS,
     CONVERGED,
     REACHED,
+    REACHED_AT,
     REQUESTED,
     WRITTEN,
+    WRITTEN_AT,
     EstimatorHeader,
     Functions,
     RequestHeader,
@@ -26,7 +28,7 @@ from ctmhe.transcription.assembly import Assembly
 from ctmhe.transcription.grid import Mesh, same_time
 from ctmhe.transcription.problem import Guess, Window
 from ctmhe.transcription.solved import Layout, Solved
-from ctmhe.types import Array, Outcome, Status
+from ctmhe.types import Array, Outcome, Status, made
 
 ELSEWHERE, TOO_SMALL = -1, -2
 NOTHING = (None, None)  # blocks of no solution
@@ -194,16 +196,16 @@ class _Memory:
 
     def found(self, outcome: Outcome) -> Update:
         """Copy the results out."""
-        n, added, measured = WRITTEN.unpack_from(self.request, RequestHeader.n.offset)
-        cost, optimality, feasibility, _, iterations, factorizations = REACHED.unpack_from(
-            self.result, ResultHeader.cost.offset
-        )
+        n, added, measured = WRITTEN.unpack_from(self.request, WRITTEN_AT)
+        cost, optimality, feasibility, _, iterations, factorizations = REACHED.unpack_from(self.result, REACHED_AT)
         parts = self.layout.parts(n)
         solved = Solved.copied(self.layout, n, self.values[parts["values"][0]], self.active[parts["active"][0]])
-        notes = () if measured else ("no measurement in window",)
-        success = outcome is Outcome.SOLVED
-        status = Status(outcome, success, iterations, optimality, feasibility, 0.0, (), notes, factorizations)
-        return Update(solved, self.path_times[:added], self.path_rows[:added], cost, status)
+        status = {
+            "outcome": outcome, "success": outcome is Outcome.SOLVED, "iterations": iterations,
+            "optimality": optimality, "feasibility": feasibility, "violation": 0.0, "rungs": (),
+            "notes": () if measured else ("no measurement in window",), "factorizations": factorizations,
+        }  # fmt: skip
+        return Update(solved, self.path_times[:added], self.path_rows[:added], cost, made(Status, status))
 
     def window_and_guess(self) -> tuple[Window, Guess]:
         """Copy out what was assembled."""
