@@ -29,7 +29,7 @@ def frozen(values: Any) -> Array:
 
 def address(array: Array) -> int:
     """Return where the memory of a writeable array begins: `array.ctypes.data`, at half the cost."""
-    return addressof(c_char.from_buffer(array))
+    return addressof(c_char.from_buffer(array))  # pyright: ignore
 
 
 def made(kind: type[T], fields: dict[str, Any]) -> T:
@@ -97,7 +97,8 @@ class Measurement:
     y: Values
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "t", finite_time(self.t, "Measurement"))
+        if type(self.t) is not float or not isfinite(self.t):
+            object.__setattr__(self, "t", finite_time(self.t, "Measurement"))
         object.__setattr__(self, "y", _vector(self.y, "Measurement", self.t))
 
 
@@ -117,7 +118,8 @@ class Input:
     u: Values
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "t", finite_time(self.t, "Input"))
+        if type(self.t) is not float or not isfinite(self.t):
+            object.__setattr__(self, "t", finite_time(self.t, "Input"))
         object.__setattr__(self, "u", _vector(self.u, "Input", self.t))
 
 

@@ -112,16 +112,14 @@ class Log:
             self.width,
         )
 
-    def extend(self, times: Array, rows: Array, *, since: float = -inf) -> Log:
-        """Return a log with ordered rows (n, width) appended, none of them before the last one, and without rows older
-        than `since`.
-        """
+    def extend(self, times: Array, rows: Array) -> Log:
+        """Return a log with ordered rows (n, width) appended, none of them before the last one."""
         count = len(times)
         if not count:
-            return self.drop_before(since)
+            return self
         shared, start, stop = self._room(count)
         shared.times[stop : stop + count], shared.rows[stop : stop + count] = times, rows
-        return Log(self.width, shared, start, stop + count).drop_before(since)
+        return Log(self.width, shared, start, stop + count)
 
     def _room(self, count: int) -> tuple[_Shared, int, int]:
         """Return storage with room for `count` rows behind those of this log, and where they start and stop in it."""

@@ -282,7 +282,8 @@ class MHE:
         state = _checked(state, self)
         if not isinstance(measurement, Measurement):
             raise InputError(f"observe expects a Measurement(t, y), got {type(measurement).__name__}")
-        t, row = measurement.t, measurement.y
+        t = measurement.t
+        row: Any = measurement.y
         complete = self.model.y.complete(row)
         if not complete:
             row = self.model.y.vector(row, f"measurement at t = {t:g}", missing=np.nan, allow_nan=True)
@@ -308,7 +309,7 @@ class MHE:
         state = _checked(state, self)
         if not isinstance(value, Input):
             raise InputError(f"control expects an Input(t, u), got {type(value).__name__}")
-        u = value.u
+        u: Any = value.u
         if not self.model.u.complete(u):
             u = self.model.u.vector(u, f"input at t = {value.t:g}")
         if state.solves:
@@ -472,7 +473,7 @@ class MHE:
             "p": p,
             "measurements": state.measurements.drop_before(edge - held - slack),
             "inputs": inputs.drop_before(edge - slack, keep_holding=True) if len(inputs) else inputs,
-            "path": path.extend(*added, since=edge - slack),
+            "path": path.extend(*added).drop_before(edge - slack),
             "since": since,
             "window": solved,
             "solves": state.solves + 1,

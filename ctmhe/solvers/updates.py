@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from functools import partial
 from threading import local
 from typing import Any, NamedTuple
 
@@ -147,18 +148,10 @@ class _Memory:
             setattr(request, name, getattr(self, name).ctypes.data)
         self._known = (self.start.ctypes.data, self.p.ctypes.data)
         structures = (stage, self.estimator, request, self.options, self.window, self.result)
-        addresses = [ctypes.addressof(structure) for structure in structures]
-        self._update, self._assemble = core.ctmhe_update, core.ctmhe_assemble
-        self._update_arguments = (*addresses, aligned)
-        self._assemble_arguments = (*addresses[:3], *addresses[4:], aligned)
-
-    def update(self) -> int:
-        """Assemble and solve what is requested."""
-        return self._update(*self._update_arguments)
-
-    def assemble(self) -> int:
-        """Assemble what is requested."""
-        return self._assemble(*self._assemble_arguments)
+        addresses = [ctypes.c_void_p(ctypes.addressof(structure)) for structure in structures]
+        room = ctypes.c_void_p(aligned)
+        self.update = partial(core.ctmhe_update, *addresses, room)  # assembles and solves what is requested
+        self.assemble = partial(core.ctmhe_assemble, *addresses[:3], *addresses[4:], room)
 
     def call(
         self,
@@ -174,10 +167,9 @@ class _Memory:
     ) -> int:
         """Write the request and call the core."""
         end = span[1]
-        tolerance = same_time(self.assembly.interval, end)
         y_times, y, y_count = measurements.memory
-        if measurements.last_time > end + tolerance:
-            y_count = measurements.count_until(end + tolerance)
+        if measurements.last_time > end:
+            y_count = measurements.count_until(end + same_time(self.assembly.interval, end))
         u_times, u, u_count = inputs.memory
         if inputs.last_time > end:
             u_count = inputs.count_until(end, beyond=int(self.assembly.input_linear))
