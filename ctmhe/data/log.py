@@ -15,7 +15,6 @@ from ctmhe.errors import InputError
 from ctmhe.types import Array, address, frozen
 
 SMALLEST = 64  # rows for which a log has room at least
-FEW = 8  # rows that are looked at one by one before a search
 
 
 class _Shared:
@@ -141,25 +140,18 @@ class Log:
 
     def drop_before(self, t: float, *, keep_holding: bool = False) -> Log:
         """Return the log without rows older than `t`; `keep_holding` keeps the last of them, which still holds."""
-        times, start, stop = self._shared.times, self._start, self._stop
-        for _ in range(FEW):
-            if start == stop or times.item(start) >= t:
-                break
+        shared, start, stop = self._shared, self._start, self._stop
+        time = shared.times.item
+        while start < stop and time(start) < t:  # one by one: mostly one or two, and each row goes once
             start += 1
-        else:
-            start = self._position(t)
-        if keep_holding and start > self._start and (start == stop or times.item(start) > t):
+        if keep_holding and start > self._start and (start == stop or time(start) > t):
             start -= 1
-        return self._from(start)
-
-    def _from(self, start: int) -> Log:
         if start == self._start:
             return self
-        live = self._stop - start
-        if len(self._shared.times) > max(SMALLEST, 8 * live):  # do not keep what is long gone
-            times, rows = self._shared.times[start : self._stop], self._shared.rows[start : self._stop]
-            return Log(self.width, _Shared(times, rows, max(SMALLEST, 2 * live)), 0, live)
-        return Log(self.width, self._shared, start, self._stop)
+        if len(shared.times) > max(SMALLEST, 8 * (stop - start)):  # do not keep what is long gone
+            shared = _Shared(shared.times[start:stop], shared.rows[start:stop], max(SMALLEST, 2 * (stop - start)))
+            start, stop = 0, shared.count
+        return Log(self.width, shared, start, stop)
 
     def drop_after(self, t: float) -> Log:
         """Return the log without rows newer than `t`."""

@@ -223,6 +223,7 @@ class MHE:
         self._check = Ipopt(self.stage, options={"ipopt.mu_init": 1e-8}) if verify else None
         self._holds = bool(self.assembly.held.any())
         self._silent = np.zeros(len(model.w))
+        self._widths = (self.stage.nx + self.stage.np, self.stage.ny)  # of a state of this estimator
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuild, (self._configuration,)
@@ -609,7 +610,7 @@ def _checked(state: Any, mhe: MHE) -> State:
         raise InputError(
             f"expected the state that init, observe or estimate returned, got {type(state).__name__}{hint}"
         )
-    if (len(state.start), state.measurements.width) != (mhe.stage.nx + mhe.stage.np, mhe.stage.ny):
+    if (len(state.start), state.measurements.width) != mhe._widths:
         raise InputError(f"this state belongs to another model than {mhe.model.name!r}: it has other signals")
     return state
 

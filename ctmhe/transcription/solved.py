@@ -26,7 +26,7 @@ class Layout:
     def __init__(self, nx: int, nw: int, np: int, nu: int, ny: int, q: int):
         self.sizes = (nx, nw, np, nu, ny, q)
         self._known: dict[int, dict[str, Part]] = {}
-        self._ends: dict[int, list[slice]] = {}
+        self._ends: dict[int, list[slice | None]] = {}
 
     @classmethod
     def of(cls, stage: StageFunction) -> Layout:
@@ -63,8 +63,8 @@ class Layout:
             parts[block] = (slice(0, start), (start,))
         return parts
 
-    def ends(self, n: int) -> list[slice]:
-        """Return the bytes of the values that hold x at the window's end, p, and w and y of the last slot."""
+    def ends(self, n: int) -> list[slice | None]:
+        """Return which bytes of the values hold x at the window's end, p, and w and y of the last slot, if any."""
         found = self._ends.get(n)
         if found is None:
             if len(self._ends) >= KEPT:
@@ -73,7 +73,7 @@ class Layout:
             stops = (
                 (self.parts(n)[name][0].stop, size) for name, size in (("x", nx), ("p", n_p), ("w", nw), ("y", ny))
             )
-            found = self._ends[n] = [slice(8 * (stop - size), 8 * stop) for stop, size in stops]
+            found = self._ends[n] = [slice(8 * (stop - size), 8 * stop) if size else None for stop, size in stops]
         return found
 
 
@@ -133,9 +133,7 @@ class Solved:
     def last(self) -> tuple[Array, Array, Array, Array]:
         """Return copies of x at the window's end, p, and w and y of the last slot."""
         block = self.blocks[0]
-        x, p, w, y = [
-            frombuffer(block[where]) if where.start < where.stop else NONE for where in self.layout.ends(self.n)
-        ]
+        x, p, w, y = [frombuffer(block[where]) if where else NONE for where in self.layout.ends(self.n)]
         return x, p, w, y
 
     @property
