@@ -1,164 +1,169 @@
 """Where one update of ctmhe spends its time: `python -m benchmarks.profile_update [--problems ...] [--compile auto]`.
 
-Functions of the library are wrapped by timers that count their own time only, without that of wrapped functions that
-they call; what no wrapped function accounts for is Python's. Wrapping costs about 1 us a call; the total is timed
-without it as well. Functions that a version of the library does not have are left out.
+An update is one call into the core, which has no clock inside. Its parts are found from outside:
+
+- Python: what `control`, `observe` and `estimate` take without the core's call, in a run that nothing disturbs;
+- window and guess: the core's `ctmhe_assemble` alone, on the request that the update left behind;
+- model functions: how much longer the same update takes when each evaluation is made twice. A few lines of C stand
+  between the core and the model, evaluate as often as they are told, and count. Results stay the same;
+- the rest of the core: linear algebra, bounds, step lengths.
+
+Parts of the core are differences between the fastest of `REPEATS` calls. All figures are medians over the updates.
 """
 
 from __future__ import annotations
 
 import argparse
-import functools
-import importlib
+import ctypes
 import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from benchmarks.problems import PROBLEMS, SCALING, Problem
-from benchmarks.reference import build, grow, observe
+from benchmarks.reference import build, grow
+from ctmhe.solvers.compilers import Source, build_library
+from ctmhe.types import Input, Measurement, Status
 
-PARTS: dict[str, tuple[str, ...]] = {
-    "model functions": (
-        "ctmhe.transcription.stage:StageFunction.values",
-        "ctmhe.transcription.stage:StageFunction.linearize",
-        "ctmhe.transcription.stage:StageFunction.curvature",
-        "ctmhe.transcription.stage:StageFunction.step",
-    ),
-    "compiled core, model functions included": ("ctmhe.solvers.compiled:CompiledGaussNewton.solve",),
-    "compiled core: copy in and out": (
-        "ctmhe.solvers.compiled:_Memory.write",
-        "ctmhe.solvers.compiled:_Memory.read",
-    ),
-    "quadratic program: build": ("ctmhe.solvers.gauss_newton:GaussNewton._quadratic_program",),
-    "quadratic program: factorise, solve, bounds": ("ctmhe.solvers.quadratic:KKT.solve",),
-    "step length and merit": (
-        "ctmhe.solvers.gauss_newton:GaussNewton._line_search",
-        "ctmhe.solvers.gauss_newton:GaussNewton._judge",
-        "ctmhe.solvers.gauss_newton:GaussNewton._model_decrease",
-        "ctmhe.solvers.gauss_newton:GaussNewton._move",
-    ),
-    "solver, other": ("ctmhe.solvers.gauss_newton:GaussNewton.solve", "ctmhe.solvers.ladder:climb"),
-    "reference solver": ("ctmhe.solvers.ipopt:Ipopt.solve",),
-    "window assembly": ("ctmhe.transcription.assembly:Assembly.window",),
-    "warm start and prior": (
-        "ctmhe.estimators.mhe:MHE._guesses",
-        "ctmhe.estimators.mhe:MHE._prior",
-    ),
-    "logs": (
-        "ctmhe.estimators.mhe:MHE._records",
-        "ctmhe.estimators.mhe:MHE.observe",
-        "ctmhe.estimators.mhe:MHE.control",
-    ),
-    "estimate and new state": ("ctmhe.estimators.mhe:MHE._to_estimate", "ctmhe.estimators.mhe:MHE._advance"),
+REPEATS = 15
+FUNCTIONS = {"value": "model, values", "jacobian": "model, Jacobians", "curvature": "model, second derivatives"}
+COUNTING = """
+#include <string.h>
+typedef int (*casadi)(const double **, double **, long long *, double *, int);
+typedef void (*buffer)(void *);
+casadi function_NAME;
+buffer eval_NAME;
+int times_NAME = 1;
+long long calls_NAME;
+volatile long long nothing_NAME = 0;
+
+int repeated_function_NAME(const double **arg, double **res, long long *iw, double *w, int mem) {
+  const double *given[64];
+  double *taken[64];
+  long long shift = 0, bits;
+  calls_NAME++;
+  for (int i = 1; i < times_NAME; i++) {
+    for (int j = 0; j < 9; j++) given[j] = arg[j] + shift; /* the function may do as it likes with both lists */
+    for (int j = 0; j < 3; j++) taken[j] = res[j];
+    if (function_NAME(given, taken, iw, w, mem)) return 1;
+    memcpy(&bits, res[0], sizeof bits);
+    shift = bits & nothing_NAME; /* zero, but the processor cannot begin the next evaluation before this one's end */
+  }
+  for (int j = 0; j < 9; j++) given[j] = arg[j] + shift;
+  return function_NAME(given, res, iw, w, mem);
 }
 
-
-class Clock:
-    """Own seconds and calls by part."""
-
-    def __init__(self):
-        self.seconds: defaultdict[str, float] = defaultdict(float)
-        self.calls: defaultdict[str, int] = defaultdict(int)
-        self._inner = [0.0]
-
-    def wrap(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a function whose own time is added to a part."""
-
-        @functools.wraps(function)
-        def timed(*arguments: Any, **keywords: Any) -> Any:
-            self._inner.append(0.0)
-            began = time.perf_counter()
-            try:
-                return function(*arguments, **keywords)
-            finally:
-                whole = time.perf_counter() - began
-                inner = self._inner.pop()
-                self._inner[-1] += whole
-                self.seconds[part] += whole - inner
-                self.calls[part] += 1
-
-        return timed
+void repeated_eval_NAME(void *self) {
+  calls_NAME++;
+  for (int i = 0; i < times_NAME; i++) eval_NAME(self);
+}
+"""
 
 
-def found(path: str) -> tuple[Any, str] | None:
-    """Return the owner and the name of `module:Class.function`, None where this version has none."""
-    module, _, name = path.partition(":")
-    try:
-        owner: Any = importlib.import_module(module)
-    except ModuleNotFoundError:
-        return None
-    *outer, last = name.split(".")
-    for part in outer:
-        owner = getattr(owner, part, None)
-    return (owner, last) if owner is not None and hasattr(owner, last) else None
+class Repeated:
+    """A stage function of a core that is evaluated as often as it is told."""
+
+    def __init__(self, structure: Any, name: str):
+        text = COUNTING.replace("NAME", name)
+        self.library = ctypes.CDLL(str(build_library(f"repeated-{name}", [Source(f"{name}.c", text)])))
+        self.times = ctypes.c_int.in_dll(self.library, f"times_{name}")
+        self.calls = ctypes.c_longlong.in_dll(self.library, f"calls_{name}")
+        kind = "function" if structure.function else "eval"
+        ctypes.c_void_p.in_dll(self.library, f"{kind}_{name}").value = getattr(structure, kind)
+        wrapper = getattr(self.library, f"repeated_{kind}_{name}")
+        setattr(structure, kind, ctypes.cast(wrapper, ctypes.c_void_p).value)
 
 
-@contextmanager
-def instrumented(clock: Clock) -> Iterator[None]:
-    """Wrap the functions of `PARTS`, also where another module imported them by name."""
-    changed: list[tuple[Any, str, Any]] = []
-    try:
-        for part, paths in PARTS.items():
-            for path in paths:
-                place = found(path)
-                if place is None:
-                    continue
-                owner, name = place
-                old = getattr(owner, name)
-                new = clock.wrap(part, old)
-                targets = [owner] + [importlib.import_module("ctmhe.estimators.mhe")] * (name == "climb")
-                for target in targets:
-                    changed.append((target, name, old))
-                    setattr(target, name, new)
-        yield
-    finally:
-        for owner, name, old in reversed(changed):
-            setattr(owner, name, old)
+def timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
+    """Return the seconds that a call takes, and its result."""
+    began = time.perf_counter()
+    result = function(*arguments)
+    return time.perf_counter() - began, result
 
 
-def run(problem: Problem, updates: int, options: dict[str, Any]) -> tuple[float, float, int]:
-    """Return the seconds of all updates, the median and the iterations."""
-    mhe = build(problem, **options)
-    state, _ = grow(mhe, problem)
-    seconds, iterations = [], 0
+def fastest(function: Callable[[], Any]) -> float:
+    """Return the seconds of the fastest of several calls."""
+    return min(timed(function)[0] for _ in range(REPEATS))
+
+
+class Run:
+    """A run of one problem, update by update, that knows how long the core's calls take."""
+
+    def __init__(self, problem: Problem, options: dict[str, Any]):
+        self.problem, self.mhe = problem, build(problem, **options)
+        self.state, _ = grow(self.mhe, problem)
+        if self.mhe._updates is None:
+            raise SystemExit(f"{problem.name}: no core here, or none that covers this problem: nothing to profile")
+        self.memory = self.mhe._updates._memory()
+        self.core, self.seconds = self.memory.update, 0.0
+        self.memory.update = self._timed  # type: ignore[assignment]
+
+    def _timed(self) -> int:
+        self.seconds, stop = timed(self.core)
+        return stop
+
+    def update(self, k: int) -> tuple[dict[str, float], Status]:
+        """Move on to window k; return the seconds of control, observe, estimate and the core, and the status."""
+        problem, mhe, seconds = self.problem, self.mhe, {}
+        j, h = problem.count + k, problem.interval
+        if len(problem.model.u):
+            u = problem.u[j - 1]
+            seconds["control"], self.state = timed(lambda: mhe.control(self.state, Input((j - 1) * h, u)))
+        y = problem.y[j]
+        seconds["observe"], self.state = timed(lambda: mhe.observe(self.state, Measurement(j * h, y)))
+        whole, (self.state, estimate) = timed(lambda: mhe.estimate(self.state, j * h))
+        assert mhe._updates is not None and mhe._updates._memory() is self.memory  # no window has outgrown the first
+        return seconds | {"estimate": whole - self.seconds, "core": self.seconds}, estimate.status
+
+
+def moving_on(problem: Problem, updates: int, options: dict[str, Any]) -> tuple[dict[str, float], list[Status]]:
+    """Return the median seconds of Python's calls and of the core's in an undisturbed run, and the statuses."""
+    run = Run(problem, options)
+    rows, statuses = zip(*(run.update(k) for k in range(1, updates + 1)), strict=True)
+    return {part: float(np.median([row[part] for row in rows])) for part in rows[0]}, list(statuses)
+
+
+def inside(problem: Problem, updates: int, options: dict[str, Any]) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the median seconds of parts of the core, and the mean numbers of evaluations."""
+    run = Run(problem, options)
+    stage = run.memory.functions.structure
+    there = [name for name in FUNCTIONS if getattr(stage, name).function or getattr(stage, name).eval]
+    functions = {FUNCTIONS[name]: Repeated(getattr(stage, name), name) for name in there}
+    rows, counts = [], []
     for k in range(1, updates + 1):
-        j = problem.count + k
-        began = time.perf_counter()
-        state = observe(mhe, state, problem, j)
-        state, estimate = mhe.estimate(state, j * problem.interval)
-        seconds.append(time.perf_counter() - began)
-        iterations += estimate.status.iterations
-    return sum(seconds), float(np.median(seconds)), iterations
+        for function in functions.values():
+            function.calls.value = 0
+        run.update(k)
+        counts.append({part: function.calls.value for part, function in functions.items()})
+        once = fastest(run.core)
+        seconds = {"window and guess": fastest(run.memory.assemble)}
+        for part, function in functions.items():
+            function.times.value = 2
+            seconds[part] = fastest(run.core) - once if counts[-1][part] else 0.0
+            function.times.value = 1
+        rows.append(seconds)
+    median = {part: float(np.median([row[part] for row in rows])) for part in rows[0]}
+    return median, {part: float(np.mean([row[part] for row in counts])) for part in counts[0]}
 
 
 def profile(problem: Problem, updates: int, options: dict[str, Any]) -> None:
     """Print the shares of one problem."""
-    _, median, _ = run(problem, updates, options)
-    clock = Clock()
-    mhe = build(problem, **options)
-    state, _ = grow(mhe, problem)  # not counted: the wrappers are not there yet
-    with instrumented(clock):
-        began = time.perf_counter()
-        iterations = 0
-        for k in range(1, updates + 1):
-            j = problem.count + k
-            state = observe(mhe, state, problem, j)
-            state, estimate = mhe.estimate(state, j * problem.interval)
-            iterations += estimate.status.iterations
-        whole = time.perf_counter() - began
-    print(
-        f"\n{problem.name}: {1e3 * median:.3f} ms median an update ({1e3 * whole / updates:.3f} ms mean with timers), "
-        f"{iterations / updates:.1f} iterations"
+    seconds, statuses = moving_on(problem, updates, options)
+    parts, calls = inside(problem, updates, options)
+    whole, core = sum(seconds.values()), seconds.pop("core")
+    rows = {f"Python: {part}": value for part, value in seconds.items()}
+    rows |= {f"core: {part}": value for part, value in parts.items()}
+    rows["core: linear algebra, bounds, steps"] = core - sum(parts.values())
+    iterations, factorizations = (
+        np.mean([getattr(status, name) for status in statuses]) for name in ("iterations", "factorizations")
     )
-    clock.seconds["Python between them"] = whole - sum(clock.seconds.values())
-    print(f"  {'part':<46}{'share':>7}{'ms':>10}{'calls':>8}")
-    for part, seconds in sorted(clock.seconds.items(), key=lambda item: -item[1]):
-        calls = f"{clock.calls[part] / updates:8.1f}" if clock.calls[part] else ""
-        print(f"  {part:<46}{seconds / whole:7.1%}{1e3 * seconds / updates:10.4f}{calls}")
+    numbers = f"{iterations:.1f} iterations, {factorizations:.1f} factorisations"
+    print(f"\n{problem.name}: {1e6 * whole:.0f} us an update, {numbers}")
+    print(f"  {'part':<40}{'share':>7}{'us':>9}{'calls':>8}")
+    for part, value in rows.items():
+        number = calls.get(part.removeprefix("core: "))
+        print(f"  {part:<40}{value / whole:7.1%}{1e6 * value:9.1f}" + (f"{number:8.1f}" if number else ""))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

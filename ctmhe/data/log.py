@@ -12,10 +12,9 @@ from typing import Any, Literal
 import numpy as np
 
 from ctmhe.errors import InputError
-from ctmhe.types import Array, frozen
+from ctmhe.types import Array, address, frozen
 
 SMALLEST = 64  # rows for which a log has room at least
-FEW = 8  # rows that are looked at one by one before a search
 
 
 class _Shared:
@@ -25,9 +24,12 @@ class _Shared:
 
     def __init__(self, times: Array, rows: Array, capacity: int):
         """Copy times (n,) and rows (n, width) to where `capacity` of them have room."""
-        self.times, self.rows, self.count = np.empty(capacity), np.empty((capacity, rows.shape[1])), len(times)
+        self.count, width = rows.shape
+        block = np.empty(capacity * (1 + width))
+        self.times, self.rows = block[:capacity], block[capacity:].reshape(capacity, width)
         self.times[: self.count], self.rows[: self.count] = times, rows
-        self.addresses = (self.times.ctypes.data, self.rows.ctypes.data)
+        start = address(block)
+        self.addresses = (start, start + 8 * capacity)
         self.lock = Lock()
 
 
@@ -96,7 +98,9 @@ class Log:
     def put(self, t: float, row: Array) -> Log:
         """Return a log that also holds `row` at `t`, in place of a row at exactly the same time."""
         if t > self.last_time:
-            return self._append(t, row, 1)
+            shared, start, stop = self._room(1)
+            shared.times[stop], shared.rows[stop] = t, row
+            return Log(self.width, shared, start, stop + 1)
         i = self._position(t)
         behind = i + 1 if i < self._stop and self._shared.times[i] == t else i
         times, rows = self._shared.times, self._shared.rows
@@ -109,9 +113,15 @@ class Log:
 
     def extend(self, times: Array, rows: Array) -> Log:
         """Return a log with ordered rows (n, width) appended, none of them before the last one."""
-        return self._append(times, rows, len(times)) if len(times) else self
+        count = len(times)
+        if not count:
+            return self
+        shared, start, stop = self._room(count)
+        shared.times[stop : stop + count], shared.rows[stop : stop + count] = times, rows
+        return Log(self.width, shared, start, stop + count)
 
-    def _append(self, times: Any, rows: Array, count: int) -> Log:
+    def _room(self, count: int) -> tuple[_Shared, int, int]:
+        """Return storage with room for `count` rows behind those of this log, and where they start and stop in it."""
         shared, start, stop = self._shared, self._start, self._stop
         with shared.lock:
             fits = stop == shared.count and stop + count <= len(shared.times)
@@ -123,34 +133,25 @@ class Log:
             shared = _Shared(shared.times[live], shared.rows[live], capacity)
             start, stop = 0, shared.count
             shared.count += count
-        shared.times[stop : stop + count] = times
-        shared.rows[stop : stop + count] = rows
-        return Log(self.width, shared, start, stop + count)
+        return shared, start, stop
 
     def _position(self, t: float, side: Literal["left", "right"] = "left") -> int:
         return self._start + int(self._shared.times[self._start : self._stop].searchsorted(t, side))
 
     def drop_before(self, t: float, *, keep_holding: bool = False) -> Log:
         """Return the log without rows older than `t`; `keep_holding` keeps the last of them, which still holds."""
-        times, start, stop = self._shared.times, self._start, self._stop
-        for _ in range(FEW):
-            if start == stop or times.item(start) >= t:
-                break
+        shared, start, stop = self._shared, self._start, self._stop
+        time = shared.times.item
+        while start < stop and time(start) < t:  # one by one: mostly one or two, and each row goes once
             start += 1
-        else:
-            start = self._position(t)
-        if keep_holding and start > self._start and (start == stop or times.item(start) > t):
+        if keep_holding and start > self._start and (start == stop or time(start) > t):
             start -= 1
-        return self._from(start)
-
-    def _from(self, start: int) -> Log:
         if start == self._start:
             return self
-        live = self._stop - start
-        if len(self._shared.times) > max(SMALLEST, 8 * live):  # do not keep what is long gone
-            times, rows = self._shared.times[start : self._stop], self._shared.rows[start : self._stop]
-            return Log(self.width, _Shared(times, rows, max(SMALLEST, 2 * live)), 0, live)
-        return Log(self.width, self._shared, start, self._stop)
+        if len(shared.times) > max(SMALLEST, 8 * (stop - start)):  # do not keep what is long gone
+            shared = _Shared(shared.times[start:stop], shared.rows[start:stop], max(SMALLEST, 2 * (stop - start)))
+            start, stop = 0, shared.count
+        return Log(self.width, shared, start, stop)
 
     def drop_after(self, t: float) -> Log:
         """Return the log without rows newer than `t`."""

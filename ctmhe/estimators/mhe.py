@@ -42,6 +42,7 @@ from ctmhe.types import (
     Status,
     finite_time,
     frozen,
+    made,
     positive,
 )
 
@@ -221,6 +222,7 @@ class MHE:
         self._check = Ipopt(self.stage, options={"ipopt.mu_init": 1e-8}) if verify else None
         self._holds = bool(self.assembly.held.any())
         self._silent = np.zeros(len(model.w))
+        self._widths = (self.stage.nx + self.stage.np, self.stage.ny)  # of a state of this estimator
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuild, (self._configuration,)
@@ -281,9 +283,12 @@ class MHE:
         if not isinstance(measurement, Measurement):
             raise InputError(f"observe expects a Measurement(t, y), got {type(measurement).__name__}")
         t = measurement.t
-        row = self.model.y.vector(measurement.y, f"measurement at t = {t:g}", missing=np.nan, allow_nan=True)
+        row: Any = measurement.y
+        complete = self.model.y.complete(row)
+        if not complete:
+            row = self.model.y.vector(row, f"measurement at t = {t:g}", missing=np.nan, allow_nan=True)
         self._check_age(state, t, "measurement")
-        if row is not measurement.y and not np.isfinite(row).any():
+        if not complete and not np.isfinite(row).any():
             return state
         self._check_step(t, "measurement")
         known = state.measurements.find(t)
@@ -304,7 +309,9 @@ class MHE:
         state = _checked(state, self)
         if not isinstance(value, Input):
             raise InputError(f"control expects an Input(t, u), got {type(value).__name__}")
-        u = self.model.u.vector(value.u, f"input at t = {value.t:g}")
+        u: Any = value.u
+        if not self.model.u.complete(u):
+            u = self.model.u.vector(u, f"input at t = {value.t:g}")
         if state.solves:
             self._check_age(state, value.t, "input")
         return state.knowing(state.measurements, state.inputs.put(value.t, u))
@@ -314,9 +321,11 @@ class MHE:
         return same_time(self.interval, t)
 
     def _check_age(self, state: State, t: float, what: str) -> None:
+        edge = state.t - self.horizon
+        if t >= state.t0 and t >= edge:
+            return
         if t < state.t0 - self._slack(t):
             raise TooLate(f"{what} at t = {t:g} s is older than the start of estimation at {state.t0:g} s")
-        edge = state.t - self.horizon
         if t < edge - self._slack(t):
             raise TooLate(
                 f"{what} at t = {t:g} s is older than the window, which starts at {edge:g} s; a longer horizon "
@@ -366,12 +375,8 @@ class MHE:
             known, times = (state.start, state.p), (state.t, since)
             update = self._updates.run(*self._span(state, t), *logs, state.window, known, times)
             if update is not None:
-                notes = () if update.measured else ("no measurement in window",)
-                found = update.outcome
-                reached = (update.iterations, update.optimality, update.feasibility)
-                status = Status(found, found is Outcome.SOLVED, *reached, 0.0, (), notes, update.factorizations)
                 added = (update.path_times, update.path_rows)
-                return self._conclude(state, t, since, update.solved, added, update.cost, status, began)
+                return self._conclude(state, t, since, update.solved, added, update.cost, update.status, began)
         window, notes = self._window(state, t)
         guesses = starting_points(self.stage, state, window)
         rungs = (window, self._solver, lambda: self._reference, guesses, notes)
@@ -462,28 +467,29 @@ class MHE:
         path = state.path if t > state.t else state.path.drop_after(since)
         held = self.hold_limit if self._holds else 0.0
         inputs = state.inputs
-        new = State(
-            state.t0,
-            t,
-            state.start,
-            x,
-            p,
-            state.measurements.drop_before(edge - held - slack),
-            inputs.drop_before(edge - slack, keep_holding=True) if len(inputs) else inputs,
-            path.extend(*added).drop_before(edge - slack),
-            since,
-            solved,
-            state.solves + 1,
-        )
+        fields = {
+            "t": t,
+            "x": x,
+            "p": p,
+            "measurements": state.measurements.drop_before(edge - held - slack),
+            "inputs": inputs.drop_before(edge - slack, keep_holding=True) if len(inputs) else inputs,
+            "path": path.extend(*added).drop_before(edge - slack),
+            "since": since,
+            "window": solved,
+            "solves": state.solves + 1,
+        }
+        new = made(State, state.__dict__ | fields)
 
         def covariance() -> tuple[Array, int]:
             window, _ = self._window(state, t)
             values, rank = self._covariance(window, solved.guess)
             return frozen(values), rank
 
-        seconds = self.clock() - began
         known = None if status.outcome is Outcome.PREDICTED else covariance
-        return new, Estimate(t, x, p, w, y, cost, status, solved, seconds, known)
+        seconds = self.clock() - began
+        fields = {"t": t, "x": x, "p": p, "w": w, "y": y, "cost": cost, "status": status, "_solved": solved,
+                  "seconds": seconds, "_covariance": known}  # fmt: skip
+        return new, made(Estimate, fields)
 
     def propagate(self, state: State, t0: float, t1: float, x: Array, p: Array) -> Array:
         """Return the state at `t1` from `x` (nx,) at `t0`, without disturbance, under the inputs that `state` knows.
@@ -603,7 +609,7 @@ def _checked(state: Any, mhe: MHE) -> State:
         raise InputError(
             f"expected the state that init, observe or estimate returned, got {type(state).__name__}{hint}"
         )
-    if (len(state.start), state.measurements.width) != (mhe.stage.nx + mhe.stage.np, mhe.stage.ny):
+    if (len(state.start), state.measurements.width) != mhe._widths:
         raise InputError(f"this state belongs to another model than {mhe.model.name!r}: it has other signals")
     return state
 

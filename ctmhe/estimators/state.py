@@ -12,13 +12,13 @@ import numpy as np
 from ctmhe.data.log import Log
 from ctmhe.errors import InputError
 from ctmhe.transcription.solved import Layout, Solved
-from ctmhe.types import Array, frozen
+from ctmhe.types import Array, frozen, made
 
 VERSION = 2
 LOGS = ("measurements", "inputs", "path")
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class State:
     """The estimator's memory at one moment.
 
@@ -57,10 +57,7 @@ class State:
 
     def knowing(self, measurements: Log, inputs: Log) -> State:
         """Return the state with other logs."""
-        return State(
-            self.t0, self.t, self.start, self.x, self.p, measurements, inputs, self.path, self.since, self.window,
-            self.solves,
-        )  # fmt: skip
+        return made(State, self.__dict__ | {"measurements": measurements, "inputs": inputs})
 
 
 def save_state(state: State, path: str | Path, fingerprint: dict[str, Any]) -> None:
@@ -109,7 +106,7 @@ def load_state(path: str | Path, fingerprint: dict[str, Any], layout: Layout) ->
             )
     window = None
     if header["slots"] is not None:
-        window = Solved.closed(layout, header["slots"], arrays["window_values"], arrays["window_active"])
+        window = Solved.copied(layout, header["slots"], arrays["window_values"], arrays["window_active"])
     logs = {name: Log.of(arrays[f"{name}_t"], rows := arrays[f"{name}_rows"], rows.shape[1]) for name in LOGS}
     return State(
         t0=header["t0"],

@@ -66,6 +66,12 @@ class Signals:
             hint = f"; did you mean {near[0]!r}?" if near else "."
             raise InputError(f"unknown {self.kind} {name!r}{hint} Known: {', '.join(self.names) or 'none'}") from None
 
+    def complete(self, values: Any) -> bool:
+        """Return whether what a `Measurement` or an `Input` holds is a vector (n,) already, without gaps."""
+        if type(values) is not np.ndarray or values.shape != (len(self.names),):
+            return False
+        return isfinite(sum(values.tolist()))  # few numbers: quicker than any call into NumPy
+
     def vector(self, values: Any, what: str, *, missing: float | None = None, allow_nan: bool = False) -> Array:
         """Return `values` (array, scalar for one signal, or mapping by name) as a read-only vector (n,).
 
@@ -73,14 +79,6 @@ class Signals:
         `allow_nan`.
         """
         n = len(self.names)
-        if (
-            type(values) is np.ndarray
-            and values.shape == (n,)
-            and values.dtype == np.float64
-            and not (values.flags.writeable or values.base is not None)
-            and isfinite(values.dot(values))
-        ):
-            return values  # the vector of a Measurement or an Input, without gaps
         if isinstance(values, Mapping):
             vector = np.full(n, np.nan if missing is None else missing)
             given = set()

@@ -6,6 +6,7 @@ import ctypes
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from struct import Struct
 from typing import Any
 
 import casadi as ca
@@ -113,12 +114,19 @@ class RequestHeader(ctypes.Structure):
         *(
             (name, _pointer)
             for name in (
-                "y_t", "y", "u_t", "u", "path_t", "path", "prior", "p", "last", "last_active", "values", "active",
-                "path_times", "path_rows",
+                "y_t", "y", "u_t", "u", "path_t", "path", "prior", "p",
             )
         ),
+        *((name, ctypes.c_char_p) for name in ("last", "last_active")),
+        *((name, _pointer) for name in ("values", "active", "path_times", "path_rows")),
         *((name, _int) for name in ("n", "path_added", "measured")),
     ]  # fmt: skip
+
+
+# One call for the fields that change from update to update: a field of a structure costs as much as five of them here.
+REQUESTED = Struct("4d 6i 8P")  # the request from `start` to `p`
+WRITTEN, WRITTEN_AT = Struct("3i"), RequestHeader.n.offset  # the request from `n` on
+REACHED, REACHED_AT = Struct("3d 3i"), ResultHeader.cost.offset  # the result from `cost` on
 
 
 class Functions:

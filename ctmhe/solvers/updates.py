@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
+from functools import partial
 from threading import local
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,11 @@ from ctmhe.data.log import Log
 from ctmhe.solvers.binding import (
     CONSTANTS,
     CONVERGED,
+    REACHED,
+    REACHED_AT,
+    REQUESTED,
+    WRITTEN,
+    WRITTEN_AT,
     EstimatorHeader,
     Functions,
     RequestHeader,
@@ -24,39 +29,31 @@ from ctmhe.transcription.assembly import Assembly
 from ctmhe.transcription.grid import Mesh, same_time
 from ctmhe.transcription.problem import Guess, Window
 from ctmhe.transcription.solved import Layout, Solved
-from ctmhe.types import Array, Outcome
+from ctmhe.types import Array, Outcome, Status, made
 
 ELSEWHERE, TOO_SMALL = -1, -2
+NOTHING = (None, None)  # blocks of no solution
 SMALLEST = 64  # slots for which there is room at least
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Update:
+class Update(NamedTuple):
     """What one update gave.
 
     Attributes
     ----------
-    outcome : Outcome
-        Solved, or stopped at a limit.
     solved : Solved
     path_times, path_rows : array (m,), (m, width)
         What the solution adds to the estimated trajectory; valid until the next update in this thread.
-    cost, optimality, feasibility : float
-    iterations, factorizations : int
-    measured : bool
-        There is a measurement in the window.
+    cost : float
+    status : Status
+        Solved, or stopped at a limit.
     """
 
-    outcome: Outcome
     solved: Solved
     path_times: Array
     path_rows: Array
     cost: float
-    optimality: float
-    feasibility: float
-    iterations: int
-    factorizations: int
-    measured: bool
+    status: Status
 
 
 class CompiledUpdates:
@@ -81,7 +78,7 @@ class CompiledUpdates:
 
     def _memory(self, capacity: int = 0) -> _Memory:
         memory: _Memory | None = getattr(self._local, "memory", None)
-        if memory is None or memory.request.capacity < capacity:
+        if memory is None or memory.capacity < capacity:
             capacity = max(SMALLEST, capacity + capacity // 2)
             memory = self._local.memory = _Memory(self.solver, self.assembly, self.layout, capacity)
         return memory
@@ -113,11 +110,10 @@ class CompiledUpdates:
         times : (last, since)
             Time of the last estimate; from when on this one defines the estimated trajectory.
         """
+        arguments = (span, growing, measurements, inputs, path, last, known, times)
         memory = self._memory()
-        stop = memory.call(memory.update, span, growing, measurements, inputs, path, last, known, times)
-        while stop == TOO_SMALL:
+        while (stop := memory.call(memory.update, *arguments)) == TOO_SMALL:
             memory = self._memory(memory.request.n)
-            stop = memory.call(memory.update, span, growing, measurements, inputs, path, last, known, times)
         outcome = self._outcomes.get(stop)
         return None if outcome is None else memory.found(outcome)
 
@@ -133,11 +129,11 @@ class _Memory:
     """Structures and scratch of one thread, for windows of up to `capacity` slots."""
 
     def __init__(self, solver: CompiledGaussNewton, assembly: Assembly, layout: Layout, capacity: int):
-        self.stage, self.layout, self.assembly = solver.stage, layout, assembly
+        self.stage, self.layout, self.assembly, self.capacity = solver.stage, layout, assembly, capacity
         core = solver.core
         self.functions = Functions(core, self.stage)
         self.estimator, self._kept = _estimator(assembly)
-        self.request, self.window, self.result = RequestHeader(capacity=capacity), WindowHeader(), ResultHeader()
+        self.request, self.window, self.result = RequestHeader(), WindowHeader(), ResultHeader()
         self.options = solver.options()
         stage = self.functions.structure
         self.scratch = np.empty(core.ctmhe_update_size(ctypes.addressof(stage), capacity) // 8 + 8)
@@ -148,22 +144,14 @@ class _Memory:
         self.path_times, self.path_rows = np.empty(capacity), np.empty((capacity, width))
         self.start, self.p = np.empty(self.stage.nx + self.stage.np), np.empty(self.stage.np)
         request = self.request
-        for name in ("values", "active", "path_times", "path_rows", "p"):
+        for name in ("values", "active", "path_times", "path_rows"):
             setattr(request, name, getattr(self, name).ctypes.data)
-        request.prior = self.start.ctypes.data
+        self._known = (self.start.ctypes.data, self.p.ctypes.data)
         structures = (stage, self.estimator, request, self.options, self.window, self.result)
-        addresses = [ctypes.addressof(structure) for structure in structures]
-        self._update, self._assemble = core.ctmhe_update, core.ctmhe_assemble
-        self._update_arguments = (*addresses, aligned)
-        self._assemble_arguments = (*addresses[:3], *addresses[4:], aligned)
-
-    def update(self) -> int:
-        """Assemble and solve what is requested."""
-        return self._update(*self._update_arguments)
-
-    def assemble(self) -> int:
-        """Assemble what is requested."""
-        return self._assemble(*self._assemble_arguments)
+        addresses = [ctypes.c_void_p(ctypes.addressof(structure)) for structure in structures]
+        room = ctypes.c_void_p(aligned)
+        self.update = partial(core.ctmhe_update, *addresses, room)  # assembles and solves what is requested
+        self.assemble = partial(core.ctmhe_assemble, *addresses[:3], *addresses[4:], room)
 
     def call(
         self,
@@ -178,46 +166,38 @@ class _Memory:
         times: tuple[float, float],
     ) -> int:
         """Write the request and call the core."""
-        request = self.request
-        request.start, request.end = span
-        request.growing = growing
-        request.last_end, request.since = times
-        tolerance = same_time(self.assembly.interval, span[1])
-        request.y_t, request.y, request.y_count = measurements.memory
-        if measurements.last_time > span[1] + tolerance:
-            request.y_count = measurements.count_until(span[1] + tolerance)
-        request.u_t, request.u, request.u_count = inputs.memory
-        if inputs.last_time > span[1]:
-            request.u_count = inputs.count_until(span[1], beyond=int(self.assembly.input_linear))
-        request.path_t, request.path, request.path_count = path.memory
+        end = span[1]
+        y_times, y, y_count = measurements.memory
+        if measurements.last_time > end:
+            y_count = measurements.count_until(end + same_time(self.assembly.interval, end))
+        u_times, u, u_count = inputs.memory
+        if inputs.last_time > end:
+            u_count = inputs.count_until(end, beyond=int(self.assembly.input_linear))
+        path_times, rows, path_count = path.memory
         if growing:
             self.start[:] = known[0]
-        if self.p.size:
+        if self.stage.np:
             self.p[:] = known[1]
-        if last is None:
-            request.last = request.last_active = None
-        else:
-            request.last, request.last_active, request.last_n = last.addresses
+        request = self.request
+        request.last, request.last_active = NOTHING if last is None else last.blocks
+        REQUESTED.pack_into(
+            request, 0, *span, *times, growing, self.capacity, y_count, u_count, path_count, last.n if last else 0,
+            y_times, y, u_times, u, path_times, rows, *self._known,
+        )  # fmt: skip
         return function()
 
     def found(self, outcome: Outcome) -> Update:
         """Copy the results out."""
-        request, result = self.request, self.result
-        n, added = request.n, request.path_added
+        n, added, measured = WRITTEN.unpack_from(self.request, WRITTEN_AT)
+        cost, optimality, feasibility, _, iterations, factorizations = REACHED.unpack_from(self.result, REACHED_AT)
         parts = self.layout.parts(n)
-        values, active = self.values[parts["values"][0]].copy(), self.active[parts["active"][0]].copy()
-        return Update(
-            outcome,
-            Solved.closed(self.layout, n, values, active),
-            self.path_times[:added],
-            self.path_rows[:added],
-            result.cost,
-            result.optimality,
-            result.feasibility,
-            result.iterations,
-            result.factorizations,
-            bool(request.measured),
-        )
+        solved = Solved.copied(self.layout, n, self.values[parts["values"][0]], self.active[parts["active"][0]])
+        status = {
+            "outcome": outcome, "success": outcome is Outcome.SOLVED, "iterations": iterations,
+            "optimality": optimality, "feasibility": feasibility, "violation": 0.0, "rungs": (),
+            "notes": () if measured else ("no measurement in window",), "factorizations": factorizations,
+        }  # fmt: skip
+        return Update(solved, self.path_times[:added], self.path_rows[:added], cost, made(Status, status))
 
     def window_and_guess(self) -> tuple[Window, Guess]:
         """Copy out what was assembled."""

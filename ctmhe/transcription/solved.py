@@ -1,4 +1,4 @@
-"""A solved window in two blocks of memory: what the core writes, what the estimator keeps."""
+"""A solved window in two blocks of memory: what the core writes and reads, what the estimator keeps."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy import frombuffer
 
 from ctmhe.transcription.problem import Guess
 from ctmhe.transcription.stage import StageFunction
-from ctmhe.types import Array, Trajectory
+from ctmhe.types import Array, Trajectory, frozen
 
 Part = tuple[slice, tuple[int, ...]]
+NONE = frozen([])
 KEPT = 1000  # layouts for as many numbers of slots
 
 
@@ -24,6 +26,7 @@ class Layout:
     def __init__(self, nx: int, nw: int, np: int, nu: int, ny: int, q: int):
         self.sizes = (nx, nw, np, nu, ny, q)
         self._known: dict[int, dict[str, Part]] = {}
+        self._ends: dict[int, list[slice | None]] = {}
 
     @classmethod
     def of(cls, stage: StageFunction) -> Layout:
@@ -60,6 +63,19 @@ class Layout:
             parts[block] = (slice(0, start), (start,))
         return parts
 
+    def ends(self, n: int) -> list[slice | None]:
+        """Return which bytes of the values hold x at the window's end, p, and w and y of the last slot, if any."""
+        found = self._ends.get(n)
+        if found is None:
+            if len(self._ends) >= KEPT:
+                self._ends.clear()
+            nx, nw, n_p, _, ny, _ = self.sizes
+            stops = (
+                (self.parts(n)[name][0].stop, size) for name, size in (("x", nx), ("p", n_p), ("w", nw), ("y", ny))
+            )
+            found = self._ends[n] = [slice(8 * (stop - size), 8 * stop) if size else None for stop, size in stops]
+        return found
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Solved:
@@ -69,14 +85,14 @@ class Solved:
     ----------
     n : int
         Slots.
-    values, active : array
-        Blocks of float64 and int8.
+    blocks : (bytes, bytes)
+        float64 values and int8 active set, in the layout's order. Compiled code reads them where they are, so they are
+        bytes: an array's address costs more than all that is done with it.
     layout : Layout
     """
 
     n: int
-    values: Array
-    active: np.ndarray
+    blocks: tuple[bytes, bytes]
     layout: Layout
 
     @classmethod
@@ -89,21 +105,25 @@ class Solved:
             if np.size(array):  # multipliers of bounds that are not there may be left empty
                 block = active if name.endswith("_active") else values
                 block[parts[name][0]] = np.reshape(array, -1)
-        return cls.closed(layout, n, values, active)
+        return cls.copied(layout, n, values, active)
 
     @classmethod
-    def closed(cls, layout: Layout, n: int, values: Array, active: np.ndarray) -> Solved:
-        """Take two blocks over, as they are, and make them read-only."""
-        values.flags.writeable = active.flags.writeable = False
-        return cls(n, values, active, layout)
+    def copied(cls, layout: Layout, n: int, values: Array, active: np.ndarray) -> Solved:
+        """Copy the two blocks, float64 and int8."""
+        return cls(n, (values.tobytes(), active.tobytes()), layout)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Solved.closed, (self.layout, self.n, self.values, self.active)
+        return Solved, (self.n, self.blocks, self.layout)
 
     @property
-    def addresses(self) -> tuple[int, int, int]:
-        """Addresses of the two blocks, and n: what compiled code reads."""
-        return self.values.ctypes.data, self.active.ctypes.data, self.n
+    def values(self) -> Array:
+        """The first block, a view."""
+        return frombuffer(self.blocks[0])
+
+    @property
+    def active(self) -> np.ndarray:
+        """The second block, a view."""
+        return frombuffer(self.blocks[1], np.int8)
 
     def part(self, name: str) -> Array:
         """Return one array by its name, a read-only view."""
@@ -112,15 +132,9 @@ class Solved:
 
     def last(self) -> tuple[Array, Array, Array, Array]:
         """Return copies of x at the window's end, p, and w and y of the last slot."""
-        parts, values = self.layout.parts(self.n), self.values
-        nx, nw, _, _, ny, _ = self.layout.sizes
-        found = []
-        for name, size in (("x", nx), ("p", None), ("w", nw), ("y", ny)):
-            where = parts[name][0]
-            array = values[where if size is None else slice(where.stop - size, where.stop)].copy()
-            array.flags.writeable = False
-            found.append(array)
-        return tuple(found)  # type: ignore[return-value]
+        block = self.blocks[0]
+        x, p, w, y = [frombuffer(block[where]) if where else NONE for where in self.layout.ends(self.n)]
+        return x, p, w, y
 
     @property
     def guess(self) -> Guess:

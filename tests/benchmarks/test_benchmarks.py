@@ -9,10 +9,12 @@ import pytest
 
 from benchmarks.peers import AGREEMENT, CONVERGED, TOOLS, Unavailable, make_tool
 from benchmarks.problems import chain, circuit, copter, reactor
+from benchmarks.profile_update import FUNCTIONS, Repeated, Run, profile
 from benchmarks.reference import refer
 from benchmarks.report import main as report
 from benchmarks.solvers import exponents, race, silence
 from benchmarks.solvers import main as run
+from ctmhe.solvers.codegen import shipped_core
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # the peers' own
 
@@ -92,3 +94,22 @@ def test_exponents_are_the_slopes_of_time_over_size():
     (fit,) = exponents(rows)
     assert fit["per_iteration"] == pytest.approx(2.0)
     assert fit["sizes"] == [200, 400, 800]
+
+
+@pytest.mark.skipif(shipped_core() is None, reason="no compiled core")
+def test_the_profile_accounts_for_an_update_without_changing_it(capsys):
+    """Its parts are named, and a model that is evaluated three times at every point gives the same solution."""
+    problem = TINY["Chua, parameter"]()
+    profile(problem, 3, {"compile": "off"})
+    printed = capsys.readouterr().out
+    for part in ("Python: observe", "Python: estimate", "window and guess", *list(FUNCTIONS.values())[:2], "algebra"):
+        assert part in printed
+    plain, repeated = (Run(problem, {"compile": "off"}) for _ in range(2))
+    stage = repeated.memory.functions.structure
+    functions = [Repeated(getattr(stage, name), name) for name in ("value", "jacobian")]
+    for function in functions:
+        function.times.value = 3
+    for k in (1, 2, 3):
+        plain.update(k), repeated.update(k)
+        assert plain.state.window.blocks == repeated.state.window.blocks
+    assert functions[1].calls.value >= 3 * problem.count

@@ -13,6 +13,7 @@ from ctmhe.estimators import MHE
 from ctmhe.estimators.guesses import shifted_guess, warm_start
 from ctmhe.models import ContinuousModel, DiscreteModel
 from ctmhe.models.library import batch_reactor
+from ctmhe.solvers.binding import REACHED, REACHED_AT, REQUESTED, WRITTEN, WRITTEN_AT, RequestHeader, ResultHeader
 from ctmhe.solvers.codegen import shipped_core
 from ctmhe.transcription import RK4
 from ctmhe.types import Bounds, DiscountedCost, Input, Measurement
@@ -149,6 +150,17 @@ def test_the_core_assembles_the_window_that_python_assembles(name, events):
             row = {"both": [a, b], "one": [a, np.nan], "two": [np.nan, b]}[kind]
             state = mhe.observe(state, Measurement(t, row))
     compare(mhe, state, t + (0.1 if mhe.model.step else 0.07))
+
+
+def test_fields_written_and_read_in_one_call_are_those_of_the_structures():
+    """The packed formats reach from the first field of their group to the last, without padding of their own."""
+    assert REQUESTED.size == RequestHeader.last.offset
+    assert WRITTEN_AT + WRITTEN.size == RequestHeader.measured.offset + RequestHeader.measured.size
+    assert REACHED_AT + REACHED.size == ResultHeader.factorizations.offset + ResultHeader.factorizations.size
+    header = RequestHeader()
+    REQUESTED.pack_into(header, 0, *range(18))
+    names = [name for name, _ in RequestHeader._fields_[:18]]
+    assert [getattr(header, name) or 0 for name in names] == list(range(18))
 
 
 def test_updates_in_the_core_are_those_of_the_long_way(rng):
