@@ -27,6 +27,7 @@ from ctmhe.solvers.compilers import Source, build_library
 from ctmhe.types import Input, Measurement, Status
 
 REPEATS = 15
+MOST = 3  # evaluations in the place of one
 FUNCTIONS = {"value": "model, values", "jacobian": "model, Jacobians", "curvature": "model, second derivatives"}
 COUNTING = """
 #include <string.h>
@@ -73,6 +74,35 @@ class Repeated:
         ctypes.c_void_p.in_dll(self.library, f"{kind}_{name}").value = getattr(structure, kind)
         wrapper = getattr(self.library, f"repeated_{kind}_{name}")
         setattr(structure, kind, ctypes.cast(wrapper, ctypes.c_void_p).value)
+
+
+class RepeatedTape:
+    """The same for a function on a tape: its instructions, written behind each other so often."""
+
+    def __init__(self, structure: Any):
+        size = 4 * structure.tape_length
+        once = np.ctypeslib.as_array(ctypes.cast(structure.tape, ctypes.POINTER(ctypes.c_int32)), (size,))
+        self.kept, self.length = np.tile(once, MOST), structure.tape_length
+        structure.tape, self.structure, self.calls = self.kept.ctypes.data, structure, ctypes.c_longlong()
+
+    @property
+    def times(self) -> RepeatedTape:
+        """What is told how often."""
+        return self
+
+    @property
+    def value(self) -> int:
+        """How often every evaluation is made."""
+        return self.structure.tape_length // self.length
+
+    @value.setter
+    def value(self, times: int) -> None:
+        self.structure.tape_length = times * self.length
+
+
+def repeated(structure: Any, name: str) -> Repeated | RepeatedTape:
+    """Take a stage function over; those on tapes cannot be counted."""
+    return RepeatedTape(structure) if structure.tape else Repeated(structure, name)
 
 
 def timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
@@ -128,8 +158,9 @@ def inside(problem: Problem, updates: int, options: dict[str, Any]) -> tuple[dic
     """Return the median seconds of parts of the core, and the mean numbers of evaluations."""
     run = Run(problem, options)
     stage = run.memory.functions.structure
-    there = [name for name in FUNCTIONS if getattr(stage, name).function or getattr(stage, name).eval]
-    functions = {FUNCTIONS[name]: Repeated(getattr(stage, name), name) for name in there}
+    kinds = ("function", "eval", "tape")
+    there = [name for name in FUNCTIONS if any(getattr(getattr(stage, name), kind) for kind in kinds)]
+    functions = {FUNCTIONS[name]: repeated(getattr(stage, name), name) for name in there}
     rows, counts = [], []
     for k in range(1, updates + 1):
         for function in functions.values():
@@ -140,7 +171,8 @@ def inside(problem: Problem, updates: int, options: dict[str, Any]) -> tuple[dic
         seconds = {"window and guess": fastest(run.memory.assemble)}
         for part, function in functions.items():
             function.times.value = 2
-            seconds[part] = fastest(run.core) - once if counts[-1][part] else 0.0
+            never = isinstance(function, Repeated) and not counts[-1][part]
+            seconds[part] = 0.0 if never else fastest(run.core) - once
             function.times.value = 1
         rows.append(seconds)
     median = {part: float(np.median([row[part] for row in rows])) for part in rows[0]}
