@@ -76,7 +76,7 @@ def copter() -> Setting:
     """The quadrotor in hover, tilted and moving."""
     model = quadrotor(noise=False)
     cost = DiscountedCost(P=1.0, Q=1e3, R_point=[1e3] * 3 + [1e4] * 3, eta=0.9)
-    mhe = MHE(model, horizon=1.5, interval=0.1, integrator=RK4(0.05), cost=cost, bounds=model.bounds, hold="point")
+    mhe = MHE(model, horizon=1.2, interval=0.1, integrator=RK4(0.1), cost=cost, bounds=model.bounds, hold="point")
     truth = [0.3, -0.2, 0.5, 0.1, -0.15, 0.3, 0.4, -0.2, 0.1, 0.1, -0.1, 0.2]
     return Setting(mhe, truth, [0.0] * 12, [], [], lambda t: [hover_speed()] * 4, [0.03] * 3 + [0.01] * 3, 0.1)
 
@@ -95,7 +95,7 @@ def tank() -> Setting:
     rates = np.array([5e-3, 1.0, 5e-3]) / 15
     cost = DiscountedCost(P=np.diag([10.0, 1e-2, 100.0, 10.0]), Q=1e-2 / rates**2, R_point=0.25, eta=1.0)
     options = dict(interval=15.0, integrator=RK4(7.5), hold="point", bounds=model.bounds)
-    mhe = MHE(model, horizon=450.0, cost=cost, **options)  # type: ignore[arg-type]
+    mhe = MHE(model, horizon=300.0, cost=cost, **options)  # type: ignore[arg-type]
     return Setting(
         mhe, [0.85, 324.0, 0.66], [0.8, 310.0, 0.7], [1.0], [0.9],
         lambda t: [300.0 + 3.0 * np.sign(np.sin(t / 40)), 0.1], [2.0], 12.0,
@@ -107,9 +107,9 @@ def oscillator() -> Setting:
     model = van_der_pol(noise=False, parameters="mu")
     cost = DiscountedCost(P=np.diag([0.1, 0.1, 0.1]), Q=1e2, R_point=1e2, eta=0.95)
     mhe = MHE(
-        model, horizon=8.0, interval=0.2, integrator=RK4(0.1), cost=cost, bounds=Bounds(p=(0.1, 3.0)), hold="point"
+        model, horizon=8.0, interval=0.4, integrator=RK4(0.1), cost=cost, bounds=Bounds(p=(0.1, 3.0)), hold="point"
     )
-    return Setting(mhe, [2.0, 0.0], [1.0, 1.0], [1.0], [0.8], None, [0.1], 0.2)
+    return Setting(mhe, [2.0, 0.0], [1.0, 1.0], [1.0], [0.8], None, [0.1], 0.3)
 
 
 def tanks() -> Setting:
@@ -118,7 +118,7 @@ def tanks() -> Setting:
     cost = DiscountedCost(P=0.1, Q=1e4, R_point=1e2, eta=0.99)
     mhe = MHE(model, horizon=120.0, interval=4.0, integrator=RK4(1.0), cost=cost, bounds=model.bounds, hold="point")
     return Setting(
-        mhe, [9.5, 6.0], [4.0, 3.0], [], [], lambda t: [4.5 + 2.0 * np.sign(np.sin(t / 20))], [0.1], 3.0
+        mhe, [9.5, 6.0], [4.0, 3.0], [], [], lambda t: [4.5 + 2.0 * np.sign(np.sin(t / 20))], [0.1], 4.0
     )
 
 

@@ -18,6 +18,8 @@
 #include "covariance.h"
 #include "update.h"
 
+#define STATIONARY 1e-6 /* residual of a step, relative, up to which it minimises the quadratic program */
+
 size_t ctmhe_scratch_size(const ctmhe_stage *stage, int n) {
   core k;
   return lay_out(&k, NULL, stage, n, NP(stage), NY(stage));
@@ -379,7 +381,11 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
       k->stiffness = 0.0;
       continue;
     }
-    if (status == OK && k->stationarity > 1e-6) status = INCONSISTENT; /* a gradient where there is no curvature */
+    /* A gradient that is left over: with second derivatives, one where there is no curvature. Else the recursion has
+     * lost digits to an unstable model far from the solution, and the step is a step all the same: it meets the
+     * linearised dynamics, and the decrease is predicted at the step as it is. It may not be the last. */
+    const int exact = k->stationarity <= STATIONARY;
+    if (status == OK && !exact && with_curvature) status = INCONSISTENT;
     if (status != OK && with_curvature) {
       newton = with_curvature = 0;
       last_decrease = NAN, last_gain = 0.0;
@@ -406,13 +412,13 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
     const double gain = fabs(predicted) > k->curvature / 2 ? fabs(predicted) : k->curvature / 2;
     const double rate = gain < last_gain ? gain / last_gain : 1.0; /* at which the gains shrink */
     if (force > rho || iteration <= SETTLED) rho = force;
-    if (k->damping == 0.0 && current->defect <= feasible && current->excess <= feasible &&
+    if (k->damping == 0.0 && exact && current->defect <= feasible && current->excess <= feasible &&
         largest_step(k) <= 100 * accuracy) { /* the step is below what the integrator can tell apart */
       stop = CTMHE_CONVERGED;
       break;
     }
     /* a full step is likely the last: it needs no new linearisation */
-    const int last = rate * gain <= enough(options, current->cost, data);
+    const int last = exact && rate * gain <= enough(options, current->cost, data);
     double merit = -HUGE_VAL; /* the worst of the last few: curved dynamics would cut good full steps */
     for (int i = 0; i < remembered; i++) {
       const double past = recent_cost[i] / 2 + rho * recent_infeasibility[i];
@@ -465,7 +471,7 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
     recent_cost[newest] = current->cost;
     recent_infeasibility[newest] = current->infeasibility;
     last_gain = alpha == 1.0 && light ? gain : 0.0;
-    if (alpha == 1.0 && light && current->defect <= feasible && current->excess <= feasible) {
+    if (alpha == 1.0 && light && exact && current->defect <= feasible && current->excess <= feasible) {
       const double off = contraction(k, trial, current);
       if (gain * (off * off > rate ? off * off : rate) <= enough(options, current->cost, data)) {
         stop = CTMHE_CONVERGED;
