@@ -20,6 +20,8 @@
 
 #define STATIONARY 1e-6 /* residual of a step, relative, up to which it minimises the quadratic program */
 
+#define SHORT 0.1 /* share of a step, below which the next is damped more */
+
 size_t ctmhe_scratch_size(const ctmhe_stage *stage, int n) {
   core k;
   return lay_out(&k, NULL, stage, n, NP(stage), NY(stage));
@@ -448,9 +450,11 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
       if (linearize(k, current)) return result->stop;
       continue;
     }
-    const double typical = !accepted || k->damping > 0.0 ? typical_curvature(k, current) : 1.0;
+    const int stunted = !accepted || alpha < SHORT; /* the linear model does not reach that far: a shorter step next */
+    const double typical = stunted || k->damping > 0.0 ? typical_curvature(k, current) : 1.0;
+    const double raised = 10 * k->damping > DAMPING_START * typical ? 10 * k->damping : DAMPING_START * typical;
     if (!accepted) {
-      k->damping = 10 * k->damping > DAMPING_START * typical ? 10 * k->damping : DAMPING_START * typical;
+      k->damping = raised;
       if (!(k->damping <= DAMPING_LIMIT * typical)) {
         stop = CTMHE_NO_DECREASE;
         break;
@@ -458,7 +462,8 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
       continue;
     }
     const int light = k->damping <= 10 * DAMPING_START * typical; /* else the small step is the damping's doing */
-    k->damping = k->damping < DAMPING_START * typical ? 0.0 : 0.1 * k->damping;
+    if (stunted) k->damping = raised < DAMPING_LIMIT * typical ? raised : k->damping;
+    else k->damping = k->damping < DAMPING_START * typical ? 0.0 : 0.1 * k->damping;
     const int slow = iteration > 4 && fabs(predicted) > SLOW * fabs(last_decrease);
     newton = stage->symbolic && alpha == 1.0 && (newton || slow);
     last_decrease = predicted;
