@@ -20,6 +20,7 @@
 
 #define STATIONARY 1e-6 /* residual of a step, relative, up to which it minimises the quadratic program */
 
+#define HIDDEN 5.0 /* what defects may hide of J/2, against the decrease that is small enough to stop */
 #define SHORT 0.1 /* share of a step, below which the next is damped more */
 
 size_t ctmhe_scratch_size(const ctmhe_stage *stage, int n) {
@@ -218,11 +219,17 @@ static double enough(const ctmhe_options *options, double cost, double data) {
   return options->tolerance * cost + ROUND_OFF * sqrt(cost * data) + options->accuracy * options->accuracy * data;
 }
 
+/* What the defects at a point hide of J/2, to first order: as the multipliers price them. */
+static double price_of_defects(const core *k, const model *m) {
+  double price = 0.0;
+  for (size_t i = 0; i < (size_t)k->N * (size_t)NX(k->s); i++) price += k->lambda[i] * m->c[i];
+  return price;
+}
+
 /* How far the quadratic model was off along a full step, relative to its own curvature there: to first order what the
  * next Gauss-Newton step is against this one. */
-static double contraction(const core *k, const model *from, const model *to) {
-  double error = to->cost / 2 - from->cost / 2 + k->decrease;
-  for (size_t i = 0; i < (size_t)k->N * (size_t)NX(k->s); i++) error += k->lambda[i] * to->c[i];
+static double contraction(const core *k, const model *from, const model *to, double price) {
+  const double error = to->cost / 2 - from->cost / 2 + k->decrease + price;
   return k->curvature > 0.0 ? 2.0 * fabs(error) / k->curvature : 1.0;
 }
 
@@ -477,8 +484,10 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
     recent_infeasibility[newest] = current->infeasibility;
     last_gain = alpha == 1.0 && light ? gain : 0.0;
     if (alpha == 1.0 && light && exact && current->defect <= feasible && current->excess <= feasible) {
-      const double off = contraction(k, trial, current);
-      if (gain * (off * off > rate ? off * off : rate) <= enough(options, current->cost, data)) {
+      const double price = price_of_defects(k, current), off = contraction(k, trial, current, price);
+      const double left = enough(options, current->cost, data);
+      if (gain * (off * off > rate ? off * off : rate) <= left &&
+          (fabs(price) <= HIDDEN * left || current->defect <= 10 * accuracy)) {
         stop = CTMHE_CONVERGED;
         break;
       }
