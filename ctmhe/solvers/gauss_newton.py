@@ -83,7 +83,7 @@ class GaussNewton:
 
     def _solve(self, window: Window, guess: Guess) -> Solution:
         kkt = self._system(window)
-        data = self._data_scale(window)
+        data, unit = self._data_scale(window)
         factorizations, damping, rho = 0, 0.0, 0.0
         step: Step | None = None
         optimality = last_decrease = float("nan")
@@ -149,7 +149,7 @@ class GaussNewton:
             last_decrease = predicted
             current = trial
             recent.append((current.cost, current.infeasibility))
-            noise = ROUND_OFF * np.sqrt(current.cost * data) + self.stage.accuracy**2 * data
+            noise = ROUND_OFF * np.sqrt(current.cost * data) + self.stage.accuracy**2 * data + ROUND_OFF**2 * unit
             enough = self.tolerance * current.cost + noise
             hidden = abs(float(np.sum(step.dynamics * current.defect)))  # of J/2, by the defects, to first order
             small = abs(predicted) <= enough and alpha == 1.0
@@ -194,11 +194,15 @@ class GaussNewton:
             systems[key] = KKT(stage.nx, stage.nw, stage.ny * key[0], stage.np * key[1])
         return systems[key]
 
-    def _data_scale(self, window: Window) -> float:
-        """Return the cost of explaining nothing: what round-off in the residuals is relative to."""
+    def _data_scale(self, window: Window) -> tuple[float, float]:
+        """Return the cost of explaining nothing, what round-off in the residuals is relative to, and that of
+        residuals as large as the signals' scales: where the data are zero, round-off is relative to these.
+        """
         data = float(np.sum((window.L_y @ window.y_data[..., None]) ** 2))
         prior = float(np.sum((window.L_prior @ window.prior[: len(window.L_prior)]) ** 2))
-        return data + prior + 1e-300
+        scale = np.concatenate([window.x_scale, window.p_scale])[: len(window.L_prior)]
+        weighted = (window.L_prior * scale, window.L_w * window.w_scale, window.L_y * window.y_scale)
+        return data + prior + 1e-300, sum(float(np.sum(part**2)) for part in weighted)
 
     def _feasible(self, current: _Iterate) -> bool:
         limit = max(1e-8, 10 * self.stage.accuracy)

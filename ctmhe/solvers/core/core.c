@@ -215,8 +215,9 @@ static void move(const core *k, const model *from, model *to, double alpha) {
 }
 
 /* The remaining decrease that is small enough to stop: relative to the cost, or below round-off. */
-static double enough(const ctmhe_options *options, double cost, double data) {
-  return options->tolerance * cost + ROUND_OFF * sqrt(cost * data) + options->accuracy * options->accuracy * data;
+static double enough(const ctmhe_options *options, double cost, double data, double unit) {
+  return options->tolerance * cost + ROUND_OFF * sqrt(cost * data) + options->accuracy * options->accuracy * data +
+         ROUND_OFF * ROUND_OFF * unit;
 }
 
 /* What the defects at a point hide of J/2, to first order: as the multipliers price them. */
@@ -246,22 +247,31 @@ static double largest_step(const core *k) {
   return largest;
 }
 
-static double data_scale(const core *k) {
+/* The cost of explaining nothing, what round-off in the residuals is relative to, and in `unit` that of residuals as
+ * large as the signals' scales: where the data are zero, round-off is relative to these. */
+static double data_scale(const core *k, double *unit) {
   const ctmhe_window *win = k->win;
-  const int ny = NY(k->s), q = NQ(k->s), width = NX(k->s) + k->np;
-  double total = 1e-300;
+  const int nw = NW(k->s), ny = NY(k->s), q = NQ(k->s), width = NX(k->s) + k->np;
+  double total = 1e-300, units = 0.0;
   for (int at = 0; at < k->N * q; at++)
     for (int i = 0; k->kind_y[at] && i < ny; i++) {
       double r = 0.0;
-      for (int j = 0; j < ny; j++)
-        r += win->L_y[((size_t)at * (size_t)ny + (size_t)i) * (size_t)ny + (size_t)j] * win->y_data[at * ny + j];
+      for (int j = 0; j < ny; j++) {
+        const double l = win->L_y[((size_t)at * (size_t)ny + (size_t)i) * (size_t)ny + (size_t)j];
+        r += l * win->y_data[at * ny + j];
+        units += l * l * win->y_scale[j] * win->y_scale[j];
+      }
       total += r * r;
     }
+  for (int slot = 0; slot < k->N; slot++)
+    for (int i = 0; i < nw; i++) units += k->W[(size_t)slot * (size_t)(nw * nw) + (size_t)(i * (nw + 1))];
   for (int i = 0; i < width; i++) {
     double r = 0.0;
     for (int j = 0; j < width; j++) r += win->L_prior[i * width + j] * win->prior[j];
     total += r * r;
+    units += k->P[i * (width + 1)];
   }
+  *unit = units;
   return total;
 }
 
@@ -357,7 +367,8 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
   result->cost = HUGE_VAL;
   if (linearize(k, current) || !(fabs(current->cost) < HUGE_VAL) || !(current->infeasibility < HUGE_VAL))
     return result->stop;
-  const double data = data_scale(k), accuracy = options->accuracy;
+  double unit;
+  const double data = data_scale(k, &unit), accuracy = options->accuracy;
   const double feasible = 10 * accuracy > 1e-8 ? 10 * accuracy : 1e-8;
   double recent_cost[MEMORY], recent_infeasibility[MEMORY];
   int remembered = 1, newest = 0;
@@ -427,7 +438,7 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
       break;
     }
     /* a full step is likely the last: it needs no new linearisation */
-    const int last = exact && rate * gain <= enough(options, current->cost, data);
+    const int last = exact && rate * gain <= enough(options, current->cost, data, unit);
     double merit = -HUGE_VAL; /* the worst of the last few: curved dynamics would cut good full steps */
     for (int i = 0; i < remembered; i++) {
       const double past = recent_cost[i] / 2 + rho * recent_infeasibility[i];
@@ -485,7 +496,7 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
     last_gain = alpha == 1.0 && light ? gain : 0.0;
     if (alpha == 1.0 && light && exact && current->defect <= feasible && current->excess <= feasible) {
       const double price = price_of_defects(k, current), off = contraction(k, trial, current, price);
-      const double left = enough(options, current->cost, data);
+      const double left = enough(options, current->cost, data, unit);
       if (gain * (off * off > rate ? off * off : rate) <= left &&
           (fabs(price) <= HIDDEN * left || current->defect <= 10 * accuracy)) {
         stop = CTMHE_CONVERGED;
