@@ -273,7 +273,7 @@ weight = st.sampled_from([0.0, 1e-6, 1.0, 1e6])
 side = st.sampled_from([None, (-INF, INF), (-0.3, INF), (-INF, 0.2), (-0.5, 0.5), (0.0, 0.0), (0.3, 0.35)])
 
 
-@settings(max_examples=int(__import__("os").environ.get("EX","30")), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     P=weight, Q=weight, R=weight, x=side, w=side, residual=side, hold=st.sampled_from(["zero", "point"]),
     gaps=st.lists(st.sampled_from([0.0, 1e-3, 0.07, 0.2, 0.65, 2.5]), max_size=6), seed=st.integers(0, 99),
