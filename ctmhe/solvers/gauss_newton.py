@@ -22,6 +22,8 @@ DAMPING_START, DAMPING_LIMIT = 1e-8, 1e8
 ROUND_OFF = 1e-15
 SETTLED = 25  # iterations after which the penalty only grows
 MEMORY = 4  # iterates that the merit function may fall back on
+SHORT = 0.1  # share of a step, below which the next is damped more
+HIDDEN = 5.0  # what defects may hide of J/2, against the decrease that is small enough to stop
 SLOW = 0.05  # predicted decreases that shrink by less than this factor call for second derivatives
 
 
@@ -81,7 +83,7 @@ class GaussNewton:
 
     def _solve(self, window: Window, guess: Guess) -> Solution:
         kkt = self._system(window)
-        data = self._data_scale(window)
+        data, unit = self._data_scale(window)
         factorizations, damping, rho = 0, 0.0, 0.0
         step: Step | None = None
         optimality = last_decrease = float("nan")
@@ -129,22 +131,30 @@ class GaussNewton:
             if trial is None and newton:
                 newton, last_decrease = False, float("nan")
                 continue
+            typical = _typical_curvature(qp)
+            raised = max(10 * damping, DAMPING_START * typical)
             if trial is None:
-                damping = max(10 * damping, DAMPING_START * _typical_curvature(qp))
-                if damping > DAMPING_LIMIT * _typical_curvature(qp):
+                damping = raised
+                if damping > DAMPING_LIMIT * typical:
                     message = "no step decreases the merit function"
                     break
                 continue
-            light = damping <= 10 * DAMPING_START * _typical_curvature(qp)  # else the small step is the damping's doing
-            damping = 0.0 if damping < DAMPING_START * _typical_curvature(qp) else 0.1 * damping
+            light = damping <= 10 * DAMPING_START * typical  # else the small step is the damping's doing
+            if alpha < SHORT:  # the linear model does not reach that far: a shorter step next
+                damping = raised if raised < DAMPING_LIMIT * typical else damping
+            else:
+                damping = 0.0 if damping < DAMPING_START * typical else 0.1 * damping
             slow = iteration > 4 and abs(predicted) > SLOW * abs(last_decrease)
             newton = self.stage.symbolic and alpha == 1.0 and (newton or slow)
             last_decrease = predicted
             current = trial
             recent.append((current.cost, current.infeasibility))
-            noise = ROUND_OFF * np.sqrt(current.cost * data) + self.stage.accuracy**2 * data
-            small = abs(predicted) <= self.tolerance * current.cost + noise and alpha == 1.0
-            if small and light and self._feasible(current):
+            noise = ROUND_OFF * np.sqrt(current.cost * data) + self.stage.accuracy**2 * data + ROUND_OFF**2 * unit
+            enough = self.tolerance * current.cost + noise
+            hidden = abs(float(np.sum(step.dynamics * current.defect)))  # of J/2, by the defects, to first order
+            small = abs(predicted) <= enough and alpha == 1.0
+            settled = hidden <= HIDDEN * enough or np.abs(current.defect).max(initial=0.0) <= 10 * self.stage.accuracy
+            if small and light and settled and self._feasible(current):
                 message, success = "converged", True
                 break
         else:
@@ -184,11 +194,15 @@ class GaussNewton:
             systems[key] = KKT(stage.nx, stage.nw, stage.ny * key[0], stage.np * key[1])
         return systems[key]
 
-    def _data_scale(self, window: Window) -> float:
-        """Return the cost of explaining nothing: what round-off in the residuals is relative to."""
+    def _data_scale(self, window: Window) -> tuple[float, float]:
+        """Return the cost of explaining nothing, what round-off in the residuals is relative to, and that of
+        residuals as large as the signals' scales: where the data are zero, round-off is relative to these.
+        """
         data = float(np.sum((window.L_y @ window.y_data[..., None]) ** 2))
         prior = float(np.sum((window.L_prior @ window.prior[: len(window.L_prior)]) ** 2))
-        return data + prior + 1e-300
+        scale = np.concatenate([window.x_scale, window.p_scale])[: len(window.L_prior)]
+        weighted = (window.L_prior * scale, window.L_w * window.w_scale, window.L_y * window.y_scale)
+        return data + prior + 1e-300, sum(float(np.sum(part**2)) for part in weighted)
 
     def _feasible(self, current: _Iterate) -> bool:
         limit = max(1e-8, 10 * self.stage.accuracy)

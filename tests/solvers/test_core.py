@@ -21,6 +21,7 @@ from ctmhe.estimators.guesses import shifted_guess
 from ctmhe.models import ContinuousModel
 from ctmhe.models.library import batch_reactor
 from ctmhe.solvers.compiled import CompiledGaussNewton
+from ctmhe.solvers.compilers import extra_flags
 from ctmhe.solvers.gauss_newton import GaussNewton
 from ctmhe.solvers.ipopt import Ipopt
 from ctmhe.transcription import RK4
@@ -43,10 +44,10 @@ def library(tmp_path_factory) -> Path:
 
 
 def build(target: Path, *flags: str, source: Path = SOURCE) -> Path:
-    """Compile the core, or what includes it."""
+    """Compile the core, or what includes it, with `$CTMHE_CFLAGS` as the library would."""
     if COMPILER is None:
         pytest.skip("no C compiler found ($CC, cc, gcc, clang)")
-    options = ["-O2", "-std=c99", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", *flags]
+    options = ["-O2", "-std=c99", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", *flags, *extra_flags()]
     subprocess.run([COMPILER, *options, str(source), "-o", str(target), "-lm"], check=True)
     return target
 

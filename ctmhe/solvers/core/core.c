@@ -18,6 +18,11 @@
 #include "covariance.h"
 #include "update.h"
 
+#define STATIONARY 1e-6 /* residual of a step, relative, up to which it minimises the quadratic program */
+
+#define HIDDEN 5.0 /* what defects may hide of J/2, against the decrease that is small enough to stop */
+#define SHORT 0.1 /* share of a step, below which the next is damped more */
+
 size_t ctmhe_scratch_size(const ctmhe_stage *stage, int n) {
   core k;
   return lay_out(&k, NULL, stage, n, NP(stage), NY(stage));
@@ -154,15 +159,22 @@ static void move(const core *k, const model *from, model *to, double alpha) {
 }
 
 /* The remaining decrease that is small enough to stop: relative to the cost, or below round-off. */
-static double enough(const ctmhe_options *options, double cost, double data) {
-  return options->tolerance * cost + ROUND_OFF * sqrt(cost * data) + options->accuracy * options->accuracy * data;
+static double enough(const ctmhe_options *options, double cost, double data, double unit) {
+  return options->tolerance * cost + ROUND_OFF * sqrt(cost * data) + options->accuracy * options->accuracy * data +
+         ROUND_OFF * ROUND_OFF * unit;
+}
+
+/* What the defects at a point hide of J/2, to first order: as the multipliers price them. */
+static double price_of_defects(const core *k, const model *m) {
+  double price = 0.0;
+  for (size_t i = 0; i < (size_t)k->N * (size_t)NX(k->s); i++) price += k->lambda[i] * m->c[i];
+  return price;
 }
 
 /* How far the quadratic model was off along a full step, relative to its own curvature there: to first order what the
  * next Gauss-Newton step is against this one. */
-static double contraction(const core *k, const model *from, const model *to) {
-  double error = to->cost / 2 - from->cost / 2 + k->decrease;
-  for (size_t i = 0; i < (size_t)k->N * (size_t)NX(k->s); i++) error += k->lambda[i] * to->c[i];
+static double contraction(const core *k, const model *from, const model *to, double price) {
+  const double error = to->cost / 2 - from->cost / 2 + k->decrease + price;
   return k->curvature > 0.0 ? 2.0 * fabs(error) / k->curvature : 1.0;
 }
 
@@ -179,22 +191,31 @@ static double largest_step(const core *k) {
   return largest;
 }
 
-static double data_scale(const core *k) {
+/* The cost of explaining nothing, what round-off in the residuals is relative to, and in `unit` that of residuals as
+ * large as the signals' scales: where the data are zero, round-off is relative to these. */
+static double data_scale(const core *k, double *unit) {
   const ctmhe_window *win = k->win;
-  const int ny = NY(k->s), q = NQ(k->s), width = NX(k->s) + k->np;
-  double total = 1e-300;
+  const int nw = NW(k->s), ny = NY(k->s), q = NQ(k->s), width = NX(k->s) + k->np;
+  double total = 1e-300, units = 0.0;
   for (int at = 0; at < k->N * q; at++)
     for (int i = 0; k->kind_y[at] && i < ny; i++) {
       double r = 0.0;
-      for (int j = 0; j < ny; j++)
-        r += win->L_y[((size_t)at * (size_t)ny + (size_t)i) * (size_t)ny + (size_t)j] * win->y_data[at * ny + j];
+      for (int j = 0; j < ny; j++) {
+        const double l = win->L_y[((size_t)at * (size_t)ny + (size_t)i) * (size_t)ny + (size_t)j];
+        r += l * win->y_data[at * ny + j];
+        units += l * l * win->y_scale[j] * win->y_scale[j];
+      }
       total += r * r;
     }
+  for (int slot = 0; slot < k->N; slot++)
+    for (int i = 0; i < nw; i++) units += k->W[(size_t)slot * (size_t)(nw * nw) + (size_t)(i * (nw + 1))];
   for (int i = 0; i < width; i++) {
     double r = 0.0;
     for (int j = 0; j < width; j++) r += win->L_prior[i * width + j] * win->prior[j];
     total += r * r;
+    units += k->P[i * (width + 1)];
   }
+  *unit = units;
   return total;
 }
 
@@ -290,7 +311,8 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
   result->cost = HUGE_VAL;
   if (linearize(k, current) || !(fabs(current->cost) < HUGE_VAL) || !(current->infeasibility < HUGE_VAL))
     return result->stop;
-  const double data = data_scale(k), accuracy = options->accuracy;
+  double unit;
+  const double data = data_scale(k, &unit), accuracy = options->accuracy;
   const double feasible = 10 * accuracy > 1e-8 ? 10 * accuracy : 1e-8;
   double recent_cost[MEMORY], recent_infeasibility[MEMORY];
   int remembered = 1, newest = 0;
@@ -320,7 +342,11 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
       k->stiffness = 0.0;
       continue;
     }
-    if (status == OK && k->stationarity > 1e-6) status = INCONSISTENT; /* a gradient where there is no curvature */
+    /* A gradient that is left over: with second derivatives, one where there is no curvature. Else the recursion has
+     * lost digits to an unstable model far from the solution, and the step is a step all the same: it meets the
+     * linearised dynamics, and the decrease is predicted at the step as it is. It may not be the last. */
+    const int exact = k->stationarity <= STATIONARY;
+    if (status == OK && !exact && with_curvature) status = INCONSISTENT;
     if (status != OK && with_curvature) {
       newton = with_curvature = 0;
       last_decrease = NAN, last_gain = 0.0;
@@ -347,13 +373,14 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
     const double gain = fabs(predicted) > k->curvature / 2 ? fabs(predicted) : k->curvature / 2;
     const double rate = gain < last_gain ? gain / last_gain : 1.0; /* at which the gains shrink */
     if (force > rho || iteration <= SETTLED) rho = force;
-    if (k->damping == 0.0 && current->defect <= feasible && current->excess <= feasible &&
+    if (k->damping == 0.0 && exact && current->defect <= feasible && current->excess <= feasible &&
         largest_step(k) <= 100 * accuracy) { /* the step is below what the integrator can tell apart */
       stop = CTMHE_CONVERGED;
       break;
     }
     /* a full step is likely the last: it needs no new linearisation */
-    const int last = iteration == options->max_iterations || rate * gain <= enough(options, current->cost, data);
+    const int last = iteration == options->max_iterations ||
+                     (exact && rate * gain <= enough(options, current->cost, data, unit));
     double merit = -HUGE_VAL; /* the worst of the last few: curved dynamics would cut good full steps */
     for (int i = 0; i < remembered; i++) {
       const double past = recent_cost[i] / 2 + rho * recent_infeasibility[i];
@@ -383,9 +410,11 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
       if (linearize(k, current)) return result->stop;
       continue;
     }
-    const double typical = !accepted || k->damping > 0.0 ? typical_curvature(k, current) : 1.0;
+    const int stunted = !accepted || alpha < SHORT; /* the linear model does not reach that far: a shorter step next */
+    const double typical = stunted || k->damping > 0.0 ? typical_curvature(k, current) : 1.0;
+    const double raised = 10 * k->damping > DAMPING_START * typical ? 10 * k->damping : DAMPING_START * typical;
     if (!accepted) {
-      k->damping = 10 * k->damping > DAMPING_START * typical ? 10 * k->damping : DAMPING_START * typical;
+      k->damping = raised;
       if (!(k->damping <= DAMPING_LIMIT * typical)) {
         stop = CTMHE_NO_DECREASE;
         break;
@@ -393,7 +422,8 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
       continue;
     }
     const int light = k->damping <= 10 * DAMPING_START * typical; /* else the small step is the damping's doing */
-    k->damping = k->damping < DAMPING_START * typical ? 0.0 : 0.1 * k->damping;
+    if (stunted) k->damping = raised < DAMPING_LIMIT * typical ? raised : k->damping;
+    else k->damping = k->damping < DAMPING_START * typical ? 0.0 : 0.1 * k->damping;
     const int slow = iteration > 4 && fabs(predicted) > SLOW * fabs(last_decrease);
     newton = stage->symbolic && alpha == 1.0 && (newton || slow);
     last_decrease = predicted;
@@ -406,9 +436,11 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
     recent_cost[newest] = current->cost;
     recent_infeasibility[newest] = current->infeasibility;
     last_gain = alpha == 1.0 && light ? gain : 0.0;
-    if (alpha == 1.0 && light && current->defect <= feasible && current->excess <= feasible) {
-      const double off = contraction(k, trial, current);
-      if (gain * (off * off > rate ? off * off : rate) <= enough(options, current->cost, data)) {
+    if (alpha == 1.0 && light && exact && current->defect <= feasible && current->excess <= feasible) {
+      const double price = price_of_defects(k, current), off = contraction(k, trial, current, price);
+      const double left = enough(options, current->cost, data, unit);
+      if (gain * (off * off > rate ? off * off : rate) <= left &&
+          (fabs(price) <= HIDDEN * left || current->defect <= 10 * accuracy)) {
         stop = CTMHE_CONVERGED;
         break;
       }
