@@ -14,7 +14,7 @@ from ctmhe.solvers.ipopt import Ipopt
 pytestmark = pytest.mark.skipif(shipped_core() is None, reason="no compiled core")
 
 # van der Pol's damping from far away: rollouts that the integrator does not survive, sensitivities of 1e10 in a cell
-UNSTABLE = (1, 335, 617, 698, 949, 964)  # starts of seed 0 from which IPOPT gets to the best cost
+UNSTABLE = (322, 552, 643, 655, 819, 975)  # starts of seed 0 from which IPOPT gets to the best cost
 
 
 def solver_of(name: str, kind: str):
