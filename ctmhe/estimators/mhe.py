@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -373,7 +373,7 @@ class MHE:
         if self._updates is not None:
             logs = (state.measurements, state.inputs, state.path)
             known, times = (state.start, state.p), (state.t, since)
-            update = self._updates.run(*self._span(state, t), *logs, state.window, known, times)
+            update = self._updates.run(*self._span(state, t), *logs, state.window, known, times, state.prepared)
             if update is not None:
                 added = (update.path_times, update.path_rows)
                 return self._conclude(state, t, since, update.solved, added, update.cost, update.status, began)
@@ -386,6 +386,45 @@ class MHE:
         solved = self._packed(window, solution)
         added = path_rows(solved.trajectory, since)
         return self._conclude(state, t, since, solved, added, solution.cost, status, began)
+
+    def prepare(self, state: State, t: float, *, outputs: Iterable[str] | None = None) -> State:
+        """Do what can be done for the estimate at `t` before the newest measurement is there.
+
+        Real time: the window that ends at `t` is assembled, linearised at the warm start and factorised, as if
+        `outputs` were measured at `t`. When they arrive, `estimate(state, t)` has only the last slot to linearise, and
+        a gradient sweep, a step and the outputs to compute. Its result is the same, to the last bit, as without, and
+        stays so when something else arrives: what was prepared is compared with what is needed, slot by slot.
+
+        What is prepared lies in this thread's scratch memory until it solves something else. Without the compiled core
+        there is nothing to prepare.
+
+        Parameters
+        ----------
+        state : State
+        t : float
+            Time of the next estimate, seconds.
+        outputs : iterable of str, optional
+            Those that will be measured at `t`; all when left out.
+
+        Returns
+        -------
+        state : State
+            To be given to `observe`, `control` and `estimate`.
+        """
+        state, t = _checked(state, self), finite_time(t, "prepare")
+        if t < state.t - self._slack(t):
+            raise NotEstimated(f"prepare at t = {t:g} s lies before the last estimate at {state.t:g} s")
+        expected = np.full(len(self.model.y), np.nan)
+        expected[[self.model.y.index(name) for name in (self.model.y.names if outputs is None else outputs)]] = 0.0
+        if self._updates is None:
+            return state
+        measurements = state.measurements
+        if measurements.find(t) is None:
+            measurements = measurements.put(t, expected)
+        since = state.since if t == state.t else state.t
+        logs, known = (measurements, state.inputs, state.path), (state.start, state.p)
+        ticket = self._updates.prepare(*self._span(state, t), *logs, state.window, known, (state.t, since))
+        return made(State, state.__dict__ | {"prepared": ticket})
 
     def _span(self, state: State, end: float) -> tuple[tuple[float, float], bool]:
         """Return start and end of the window that ends at `end`, and whether it still grows."""
@@ -477,6 +516,7 @@ class MHE:
             "since": since,
             "window": solved,
             "solves": state.solves + 1,
+            "prepared": None,
         }
         new = made(State, state.__dict__ | fields)
 

@@ -41,6 +41,8 @@ class State:
     window : Solved or None
         The last solution: warm start, and what `smooth` reads.
     solves : int
+    prepared : object or None
+        Says that the estimator has prepared the next estimate from this state; of no influence on its result.
     """
 
     t0: float
@@ -54,6 +56,7 @@ class State:
     since: float
     window: Solved | None = None
     solves: int = 0
+    prepared: object | None = None
 
     def knowing(self, measurements: Log, inputs: Log) -> State:
         """Return the state with other logs."""

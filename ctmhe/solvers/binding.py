@@ -16,7 +16,7 @@ from ctmhe.errors import SolverError
 from ctmhe.solvers.tape import BATCH, tape_of
 from ctmhe.transcription.stage import StageFunction
 
-VERSION = 4
+VERSION = 5
 MAX_ARGUMENTS = 64
 CONVERGED, ITERATION_LIMIT, NOT_FINITE, NO_DECREASE, SINGULAR, DEADLINE = range(6)
 STAGE_FUNCTIONS = ("ctmhe_stage_value", "ctmhe_stage_jacobian", "ctmhe_stage_curvature")
@@ -110,7 +110,7 @@ class RequestHeader(ctypes.Structure):
 
     _fields_ = [
         *((name, _double) for name in ("start", "end", "last_end", "since")),
-        *((name, _int) for name in ("growing", "capacity", "y_count", "u_count", "path_count", "last_n")),
+        *((name, _int) for name in ("growing", "capacity", "y_count", "u_count", "path_count", "last_n", "prepared")),
         *(
             (name, _pointer)
             for name in (
@@ -124,7 +124,7 @@ class RequestHeader(ctypes.Structure):
 
 
 # One call for the fields that change from update to update: a field of a structure costs as much as five of them here.
-REQUESTED = Struct("4d 6i 8P")  # the request from `start` to `p`
+REQUESTED = Struct("4d 7i 8P")  # the request from `start` to `p`
 WRITTEN, WRITTEN_AT = Struct("3i"), RequestHeader.n.offset  # the request from `n` on
 REACHED, REACHED_AT = Struct("3d 3i"), ResultHeader.cost.offset  # the result from `cost` on
 
@@ -229,6 +229,7 @@ def load(library: Path) -> ctypes.CDLL:
     core.ctmhe_solve.argtypes, core.ctmhe_solve.restype = [_pointer] * 5, _int
     core.ctmhe_update_size.argtypes, core.ctmhe_update_size.restype = [_pointer, _int], ctypes.c_size_t
     core.ctmhe_assemble.argtypes, core.ctmhe_assemble.restype = [_pointer] * 6, _int
+    core.ctmhe_prepare.argtypes, core.ctmhe_prepare.restype = [_pointer] * 6, _int
     core.ctmhe_update.argtypes, core.ctmhe_update.restype = [_pointer] * 7, _int
     core.ctmhe_covariance.argtypes, core.ctmhe_covariance.restype = [_pointer] * 6, _int
     core.ctmhe_sizes.argtypes, core.ctmhe_sizes.restype = [_pointer] * 6, None

@@ -93,6 +93,7 @@ class CompiledUpdates:
         last: Solved | None,
         known: tuple[Array, Array],
         times: tuple[float, float],
+        ticket: object | None = None,
     ) -> Update | None:
         """Return the update of a window, None where the caller's own way has to be taken.
 
@@ -109,17 +110,39 @@ class CompiledUpdates:
             Initial estimate; parameters of the last one.
         times : (last, since)
             Time of the last estimate; from when on this one defines the estimated trajectory.
+        ticket : object, optional
+            What `prepare` returned. Worth something only in the thread that prepared, and while nothing else was
+            solved there; the result is the same without.
         """
         arguments = (span, growing, measurements, inputs, path, last, known, times)
         memory = self._memory()
+        memory.prepared = ticket is not None and ticket is memory.ticket
+        memory.ticket = None
         while (stop := memory.call(memory.update, *arguments)) == TOO_SMALL:
             memory = self._memory(memory.request.n)
         outcome = self._outcomes.get(stop)
         return None if outcome is None else memory.found(outcome)
 
+    def prepare(self, *arguments: Any) -> object | None:
+        """Linearise and factorise the window that is expected; the arguments are those of `run`.
+
+        Returns
+        -------
+        object or None
+            A ticket for `run`; None where there is nothing to prepare.
+        """
+        memory = self._memory()
+        memory.ticket, memory.prepared = None, False
+        while (stop := memory.call(memory.prepare, *arguments)) == TOO_SMALL:
+            memory = self._memory(memory.request.n)
+        if stop == 0:
+            memory.ticket = object()
+        return memory.ticket
+
     def assembled(self, *arguments: Any) -> tuple[Window, Guess] | None:
         """Return copies of the window and the guess that `run` would solve from; None where it would return None."""
         memory = self._memory()
+        memory.ticket, memory.prepared = None, False
         while (stop := memory.call(memory.assemble, *arguments)) == TOO_SMALL:
             memory = self._memory(memory.request.n)
         return memory.window_and_guess() if stop == 0 else None
@@ -152,6 +175,9 @@ class _Memory:
         room = ctypes.c_void_p(aligned)
         self.update = partial(core.ctmhe_update, *addresses, room)  # assembles and solves what is requested
         self.assemble = partial(core.ctmhe_assemble, *addresses[:3], *addresses[4:], room)
+        self.prepare = partial(core.ctmhe_prepare, *addresses[:3], *addresses[4:], room)
+        self.ticket: object | None = None  # of what the scratch has been prepared for
+        self.prepared = False
 
     def call(
         self,
@@ -182,7 +208,7 @@ class _Memory:
         request.last, request.last_active = NOTHING if last is None else last.blocks
         REQUESTED.pack_into(
             request, 0, *span, *times, growing, self.capacity, y_count, u_count, path_count, last.n if last else 0,
-            y_times, y, u_times, u, path_times, rows, *self._known,
+            self.prepared, y_times, y, u_times, u, path_times, rows, *self._known,
         )  # fmt: skip
         return function()
 

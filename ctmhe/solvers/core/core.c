@@ -283,9 +283,55 @@ static double largest_force(const core *k) {
   return largest;
 }
 
-int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmhe_options *options,
-                ctmhe_result *result, void *scratch) {
-  core memory, *k = &memory;
+/* A prepared window: what its linearisation depends on, the point apart, which is in k->a. */
+#define FOR_ARRAYS_OF_SLOTS(use)                                                                            \
+  use(h, 1) use(u0, nu) use(u1, nu) use(L_w, nw * nw) use(L_y, q * ny * ny) use(y_data, q * ny) use(shared, 1) \
+  if (k->nb) {                                                                                              \
+    use(y_lower, ny) use(y_upper, ny)                                                                       \
+  }
+
+static void remember(core *k, int factorized) {
+  const ctmhe_stage *s = k->s;
+  const ctmhe_window *win = k->win;
+  const size_t N = (size_t)k->N, nu = (size_t)s->nu, nw = (size_t)NW(s), ny = (size_t)NY(s), q = (size_t)NQ(s);
+  const size_t width = (size_t)(NX(s) + k->np);
+  memo *m = k->memo;
+#define REMEMBER(name, size) memcpy(m->name, win->name, sizeof *m->name * N * (size));
+  FOR_ARRAYS_OF_SLOTS(REMEMBER)
+#undef REMEMBER
+  copy(m->t, win->t, N + 1);
+  copy(m->prior, win->prior, width);
+  copy(m->L_prior, win->L_prior, width * width);
+  m->N = k->N, m->np = k->np, m->nb = k->nb;
+  m->factorized = factorized;
+  m->valid = 1;
+}
+
+static void mark_stale(core *k) {
+  const ctmhe_stage *s = k->s;
+  const ctmhe_window *win = k->win;
+  const size_t N = (size_t)k->N, nu = (size_t)s->nu, nw = (size_t)NW(s), ny = (size_t)NY(s), q = (size_t)NQ(s);
+  const size_t width = (size_t)(NX(s) + k->np);
+  const memo *m = k->memo;
+  memset(k->stale, 0, N);
+#define MARK(name, size)                                                                                     \
+  if (memcmp(m->name, win->name, sizeof *m->name * N * (size)))                                              \
+    for (size_t slot = 0; slot < N; slot++)                                                                  \
+      if (memcmp(m->name + slot * (size), win->name + slot * (size), sizeof *m->name * (size))) k->stale[slot] = 1;
+  FOR_ARRAYS_OF_SLOTS(MARK)
+  MARK(t, 1)
+#undef MARK
+  if (memcmp(m->prior, win->prior, sizeof(double) * width) ||
+      memcmp(m->L_prior, win->L_prior, sizeof(double) * width * width))
+    k->stale[0] = 1;
+  for (size_t slot = 0; slot + 1 < N; slot++) /* who carries w changes its neighbour's factors too */
+    if (m->shared[slot] != win->shared[slot]) k->stale[slot + 1] = 1, k->memo->factorized = 0;
+}
+
+/* Take a window up: memory, what the sweeps need of it, and the guess in k->a, moved into the bounds. With `prepared`,
+ * mark what differs from the window in memory and return whether anything of it can be used. */
+static int take_up(core *k, const ctmhe_stage *stage, const ctmhe_window *window, const ctmhe_result *guess,
+                   void *scratch, int prepared) {
   const int nx = NX(stage), nw = NW(stage), N = window->n;
   k->s = stage;
   k->win = window;
@@ -294,23 +340,55 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
   k->n = nw + nx + k->np;
   k->nb = window->output_bounded ? NY(stage) : 0;
   lay_out(k, scratch, stage, N, k->np, k->nb);
-  prepare(k, result);
+  const memo *known = k->memo;
+  prepared = prepared && known->valid && known->N == N && known->np == k->np && known->nb == k->nb;
+  uint8_t *stale = k->stale;
+  if (prepared) mark_stale(k);
+  prepare(k, guess);
   k->damping = 0.0;
+  k->rebuilt = N;
   for (int i = 0; i < N * nx; i++) k->lambda[i] = 0.0;
+  double *x = k->a.x, *w = k->a.w, *p = k->a.p;
+  for (int i = 0; i < (N + 1) * nx; i++) {
+    const double value = clip(guess->x[i], window->x_lower[i], window->x_upper[i]);
+    if (prepared && value != x[i]) {
+      if (i < N * nx) stale[i / nx] = 1;
+      if (i >= nx) stale[i / nx - 1] = 1;
+    }
+    x[i] = value;
+  }
+  for (int slot = 0; slot < N; slot++)
+    for (int i = 0; i < nw; i++) {
+      const int at = slot * nw + i, from = slot && window->shared[slot - 1] ? at - nw : at; /* one w for all slots of a cell */
+      const double value = from == at ? clip(guess->w[at], window->w_lower[at], window->w_upper[at]) : w[from];
+      if (prepared && value != w[at]) stale[slot] = 1;
+      w[at] = value;
+    }
+  for (int i = 0; i < NP(stage); i++) {
+    const double value = k->np ? clip(guess->p[i], window->p_lower[i], window->p_upper[i]) : guess->p[i];
+    if (prepared && value != p[i]) memset(stale, 1, (size_t)N);
+    p[i] = value;
+  }
+  if (!prepared) k->stale = NULL;
+  return prepared;
+}
+
+static int solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmhe_options *options,
+                 ctmhe_result *result, void *scratch, int prepared) {
+  core memory, *k = &memory;
+  prepared = take_up(k, stage, window, result, scratch, prepared);
+  const int factorized = prepared && k->memo->factorized;
+  k->memo->valid = 0;
+  if (factorized) k->rebuilt = -1;
   model *current = &k->a, *trial = &k->b;
-  for (int i = 0; i < (N + 1) * nx; i++) current->x[i] = clip(result->x[i], window->x_lower[i], window->x_upper[i]);
-  for (int i = 0; i < N * nw; i++) current->w[i] = clip(result->w[i], window->w_lower[i], window->w_upper[i]);
-  for (int slot = 0; slot + 1 < N; slot++) /* one w for all slots of a cell */
-    if (window->shared[slot])
-      for (int i = 0; i < nw; i++) current->w[(slot + 1) * nw + i] = current->w[slot * nw + i];
-  for (int i = 0; i < NP(stage); i++)
-    current->p[i] = k->np ? clip(result->p[i], window->p_lower[i], window->p_upper[i]) : result->p[i];
   result->iterations = result->factorizations = 0;
   result->optimality = result->feasibility = NAN;
   result->stop = CTMHE_NOT_FINITE;
   result->cost = HUGE_VAL;
   if (linearize(k, current) || !(fabs(current->cost) < HUGE_VAL) || !(current->infeasibility < HUGE_VAL))
     return result->stop;
+  k->stale = NULL;
+  if (!factorized) k->rebuilt = window->n;
   double unit;
   const double data = data_scale(k, &unit), accuracy = options->accuracy;
   const double feasible = 10 * accuracy > 1e-8 ? 10 * accuracy : 1e-8;
@@ -453,6 +531,11 @@ int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmh
   return stop;
 }
 
+int ctmhe_solve(const ctmhe_stage *stage, const ctmhe_window *window, const ctmhe_options *options,
+                ctmhe_result *result, void *scratch) {
+  return solve(stage, window, options, result, scratch, 0);
+}
+
 /* ---- Updates ------------------------------------------------------------------------------------------------ */
 
 size_t ctmhe_update_size(const ctmhe_stage *stage, int capacity) {
@@ -466,12 +549,28 @@ int ctmhe_assemble(const ctmhe_stage *stage, const ctmhe_estimator *estimator, c
   return assemble(&a, stage, estimator, request, window, result, scratch);
 }
 
+int ctmhe_prepare(const ctmhe_stage *stage, const ctmhe_estimator *estimator, ctmhe_request *request,
+                  ctmhe_window *window, ctmhe_result *result, void *scratch) {
+  assembly a;
+  core memory, *k = &memory;
+  const int outcome = assemble(&a, stage, estimator, request, window, result, scratch);
+  if (outcome) return outcome;
+  take_up(k, stage, window, result, a.solve, 0);
+  k->memo->valid = 0;
+  if (linearize(k, &k->a)) return CTMHE_NOT_FINITE;
+  k->calm = !any_held(k);
+  k->plain = 1;
+  k->barrier = 0;
+  remember(k, k->calm && backward(k, &k->a, k->N, 0) == OK);
+  return 0;
+}
+
 int ctmhe_update(const ctmhe_stage *stage, const ctmhe_estimator *estimator, ctmhe_request *request,
                  const ctmhe_options *options, ctmhe_window *window, ctmhe_result *result, void *scratch) {
   assembly a;
   const int outcome = assemble(&a, stage, estimator, request, window, result, scratch);
   if (outcome) return outcome;
-  const int stop = ctmhe_solve(stage, window, options, result, a.solve);
+  const int stop = solve(stage, window, options, result, a.solve, request->prepared);
   if (stop == CTMHE_CONVERGED || stop == CTMHE_ITERATION_LIMIT || stop == CTMHE_DEADLINE)
     write_path(&a, window, result, request);
   return stop;

@@ -17,7 +17,7 @@
 extern "C" {
 #endif
 
-#define CTMHE_CORE_VERSION 4
+#define CTMHE_CORE_VERSION 5
 #define CTMHE_BATCH 8          /* slots that a tape is run for at once */
 #define CTMHE_MAX_ARGUMENTS 64 /* pointers a compiled stage function may use (CasADi's sz_arg, sz_res) */
 
@@ -125,6 +125,7 @@ typedef struct {              /* one update: what is known, and where the result
   int growing;                /* the window starts at t0: the prior is `prior` */
   int capacity;               /* slots that there is room for */
   int y_count, u_count, path_count, last_n;
+  int prepared;               /* the scratch is as ctmhe_prepare left it */
   const double *y_t, *y;      /* (y_count), (y_count, ny) measurements up to the end, NaN missing */
   const double *u_t, *u;      /* (u_count), (u_count, nu) inputs */
   const double *path_t, *path; /* (path_count), (path_count, width): the estimated trajectory, a slot a row */
@@ -149,6 +150,12 @@ size_t ctmhe_update_size(const ctmhe_stage *stage, int capacity);
  * an outcome. */
 int ctmhe_assemble(const ctmhe_stage *stage, const ctmhe_estimator *estimator, ctmhe_request *request,
                    ctmhe_window *window, ctmhe_result *result, void *scratch);
+
+/* What can be done before the newest measurement is there: assemble the window that is expected, linearise it at the
+ * guess and factorise. The update that follows on the same scratch with `prepared` set repeats only what differs; its
+ * results are the same to the last bit. Returns 0, CTMHE_NOT_FINITE or an outcome. */
+int ctmhe_prepare(const ctmhe_stage *stage, const ctmhe_estimator *estimator, ctmhe_request *request,
+                  ctmhe_window *window, ctmhe_result *result, void *scratch);
 
 /* Assemble and solve. Returns the stop code or an outcome. */
 int ctmhe_update(const ctmhe_stage *stage, const ctmhe_estimator *estimator, ctmhe_request *request,

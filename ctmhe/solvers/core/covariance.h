@@ -223,6 +223,8 @@ int ctmhe_covariance(const ctmhe_stage *stage, const ctmhe_window *window, const
   k->n = NW(stage) + NX(stage) + k->np;
   k->nb = 0;
   lay_out(k, scratch, stage, N, k->np, k->nb);
+  k->memo->valid = 0;
+  k->stale = NULL;
   prepare(k, point);
   copy(m->x, point->x, (size_t)((N + 1) * NX(stage)));
   copy(m->w, point->w, (size_t)(N * NW(stage)));

@@ -57,8 +57,15 @@ typedef struct {           /* the problem linearised at a point */
   double *c;               /* (N, nx) scaled defects */
   double *H, *g;           /* (N, n, n) upper triangles, (N, n) */
   double *J;               /* (N, nx + nb, n) scaled dynamics rows, then bounded output rows */
+  double *parts;           /* (N, 4) each slot's share of the following, the prior's cost apart */
   double cost, infeasibility, defect, excess;
 } model;
+
+typedef struct {           /* the window that the linearisation and the factors in memory belong to */
+  int valid, N, np, nb, factorized;
+  double *t, *h, *u0, *u1, *prior, *L_prior, *L_w, *L_y, *y_data, *y_lower, *y_upper;
+  uint8_t *shared;
+} memo;
 
 typedef struct {
   const ctmhe_stage *s;
@@ -84,6 +91,10 @@ typedef struct {
   int barrier;             /* the interior point method is at work */
   int calm;                /* nothing is held, pushed or damped */
   int relative;            /* `low` and `high` belong to the point */
+  int rebuilt;             /* slots behind this one have their factors already; N: none has */
+  memo *memo;
+  uint8_t *stale;          /* (N) slots whose linearisation is not the one in memory; NULL: all */
+  double *before;          /* H and J of a slot before it is linearised again */
   double *lambda;          /* (N, nx) */
   int8_t *active, *candidate, *cautious, *kept;
   uint8_t *fixed;
@@ -118,6 +129,25 @@ static void lay_out_model(model *m, arena *memory, size_t N, size_t nx, size_t n
   m->H = DOUBLES(memory, N * n * n);
   m->g = DOUBLES(memory, N * n);
   m->J = DOUBLES(memory, N * (nx + nb) * n);
+  m->parts = DOUBLES(memory, 4 * N);
+}
+
+static void lay_out_memo(memo *m, arena *memory, const ctmhe_stage *s, size_t N) {
+  const size_t nw = (size_t)NW(s), ny = (size_t)NY(s), q = (size_t)NQ(s), width = (size_t)(NX(s) + NP(s));
+  memo found = *m;
+  found.t = DOUBLES(memory, N + 1);
+  found.h = DOUBLES(memory, N);
+  found.u0 = DOUBLES(memory, N * (size_t)s->nu);
+  found.u1 = DOUBLES(memory, N * (size_t)s->nu);
+  found.prior = DOUBLES(memory, width);
+  found.L_prior = DOUBLES(memory, width * width);
+  found.L_w = DOUBLES(memory, N * nw * nw);
+  found.L_y = DOUBLES(memory, N * q * ny * ny);
+  found.y_data = DOUBLES(memory, N * q * ny);
+  found.y_lower = DOUBLES(memory, N * ny);
+  found.y_upper = DOUBLES(memory, N * ny);
+  found.shared = take(memory, N);
+  if (memory->at) *m = found;
 }
 
 /* Doubles of work for one integration step, and for the second derivatives of a slot: see slot.h. */
@@ -136,6 +166,8 @@ static size_t lay_out(core *k, char *scratch, const ctmhe_stage *s, int slots, i
   const size_t N = (size_t)slots, nx = (size_t)NX(s), nw = (size_t)NW(s), ny = (size_t)NY(s), q = (size_t)NQ(s);
   const size_t all = (size_t)NP(s), n = nw + nx + (size_t)np, qy = q * ny, n0 = nx + nw + all;
   arena memory = {scratch, 0};
+  memo none = {0};
+  k->memo = take(&memory, sizeof(memo)); /* first: found again whatever the sizes of the next window */
   k->fw = (N + 1) * nx;
   k->fy = k->fw + N * nw;
   k->fp = k->fy + N * (size_t)nb;
@@ -177,6 +209,8 @@ static size_t lay_out(core *k, char *scratch, const ctmhe_stage *s, int slots, i
   k->second = DOUBLES(&memory, curvature_work_size(s));
   lay_out_model(&k->a, &memory, N, nx, nw, all, qy, n, (size_t)nb);
   lay_out_model(&k->b, &memory, N, nx, nw, all, qy, n, (size_t)nb);
+  k->before = DOUBLES(&memory, n * n + (nx + (size_t)nb) * n);
+  k->stale = take(&memory, N);
   k->kind_w = take(&memory, N);
   k->kind_y = take(&memory, N * q + 1);
   k->fixed = take(&memory, k->nf);
@@ -184,6 +218,7 @@ static size_t lay_out(core *k, char *scratch, const ctmhe_stage *s, int slots, i
   k->candidate = take(&memory, k->nf);
   k->cautious = take(&memory, k->nf);
   k->kept = take(&memory, k->nf);
+  lay_out_memo(scratch ? k->memo : &none, &memory, s, N);
   return memory.used;
 }
 

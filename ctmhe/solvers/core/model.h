@@ -77,22 +77,31 @@ INLINE int linearize_sized(core *k, model *m, int with_jacobian, int nx, int nw,
   const int N = k->N, ny = NY(s), q = NQ(s), n = nw + nx + np, nb = k->nb, height = nx + q * ny, all = NP(s);
   const int width = nx + np; /* of the prior */
   const ctmhe_function *f = with_jacobian ? &s->jacobian : &s->value;
-  double cost = 0.0, infeasibility = 0.0, defect = 0.0, excess = 0.0, finite = 0.0;
+  const uint8_t *stale = with_jacobian ? k->stale : NULL;
+  double total = 0.0, all_infeasible = 0.0, largest_defect = 0.0, largest_excess = 0.0;
   double *scaled_w = k->v;
   for (int i = 0; i < width; i++) { /* prior */
     double r = 0.0;
     for (int j = 0; j < width; j++)
       r += win->L_prior[i * width + j] * ((j < nx ? m->x[j] : m->p[j - nx]) - win->prior[j]);
-    cost += r * r;
+    total += r * r;
   }
   const int lanes = f->tape ? BATCH : 1, qy = q * ny, lane_size = nx + qy + (nx + qy) * (nx + nw + all);
   const int direct = f->function && s->steps == 1;
   for (int slot = 0; slot < N; slot++) {
     const int lane = slot % lanes;
+    double *parts = m->parts + 4 * slot, cost = 0.0, infeasibility = 0.0, defect = 0.0, excess = 0.0, finite = 0.0;
     if (direct) {
-      if (evaluate_directly(k, f, m, slot, with_jacobian)) return 1;
+      if ((!stale || stale[slot]) && evaluate_directly(k, f, m, slot, with_jacobian)) return 1;
     } else if (lane == 0) {
-      if (evaluate(k, f, m, slot, N - slot < lanes ? N - slot : lanes, with_jacobian)) return 1;
+      const int count = N - slot < lanes ? N - slot : lanes;
+      if ((!stale || memchr(stale + slot, 1, (size_t)count)) && evaluate(k, f, m, slot, count, with_jacobian)) return 1;
+    }
+    if (stale && !stale[slot]) {
+      total += parts[0], all_infeasible += parts[1];
+      if (parts[2] > largest_defect) largest_defect = parts[2];
+      if (parts[3] > largest_excess) largest_excess = parts[3];
+      continue;
     }
     const double *reached = k->lane + lane * lane_size, *y = reached + nx, *jacobian = y + qy;
     const double *next = m->x + (size_t)(slot + 1) * (size_t)nx;
@@ -122,6 +131,10 @@ INLINE int linearize_sized(core *k, model *m, int with_jacobian, int nx, int nw,
     }
     const double *w = m->w + (size_t)slot * (size_t)nw, *W = k->W + (size_t)slot * (size_t)(nw * nw);
     double *H = m->H + (size_t)slot * (size_t)(n * n), *g = m->g + (size_t)slot * (size_t)n;
+    if (stale) {
+      copy(k->before, H, (size_t)(n * n));
+      copy(k->before + n * n, m->J + (size_t)slot * (size_t)((nx + nb) * n), (size_t)((nx + nb) * n));
+    }
     if (with_jacobian) {
       memset(H, 0, sizeof(double) * (size_t)(n * n));
       memset(g, 0, sizeof(double) * (size_t)n);
@@ -161,6 +174,10 @@ INLINE int linearize_sized(core *k, model *m, int with_jacobian, int nx, int nw,
         }
       }
     }
+    parts[0] = cost + finite, parts[1] = infeasibility, parts[2] = defect, parts[3] = excess;
+    total += parts[0], all_infeasible += infeasibility;
+    if (defect > largest_defect) largest_defect = defect;
+    if (excess > largest_excess) largest_excess = excess;
     if (!with_jacobian) continue;
     double *restrict J = m->J + (size_t)slot * (size_t)((nx + nb) * n);
     for (int i = 0; i < nx; i++) {
@@ -189,11 +206,14 @@ INLINE int linearize_sized(core *k, model *m, int with_jacobian, int nx, int nw,
           if (j >= i) H[(nw + i) * n + nw + j] += k->P[i * width + j];
         }
     }
+    if (stale && (memcmp(k->before, H, sizeof(double) * (size_t)(n * n)) ||
+                  memcmp(k->before + n * n, J, sizeof(double) * (size_t)((nx + nb) * n))))
+      k->rebuilt = slot;
   }
-  m->cost = cost + finite;
-  m->infeasibility = infeasibility;
-  m->defect = defect;
-  m->excess = excess;
+  m->cost = total;
+  m->infeasibility = all_infeasible;
+  m->defect = largest_defect;
+  m->excess = largest_excess;
   return 0;
 }
 

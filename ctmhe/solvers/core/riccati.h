@@ -157,9 +157,9 @@ INLINE int backward_sized(core *k, const model *m, int from, int right_hand_side
     double *U = k->U + (size_t)slot * nn, *D = k->D + (size_t)(slot * n), *q = k->q + (size_t)(slot * n);
     const double *behind = U + nn, *J = m->J + (size_t)(slot * (nx + nb)) * (size_t)n;
     const double *g = m->g + (size_t)(slot * n), *H = m->H + (size_t)slot * nn;
-    const int eliminated = slot == 0 ? n : first ? nw : 0;
+    const int eliminated = slot == 0 ? n : first ? nw : 0, known = right_hand_side || (calm && slot > k->rebuilt);
     for (int i = 0; i < n; i++) q[i] = right_hand_side ? 0.0 : g[i];
-    if (right_hand_side) {
+    if (known) {
     } else if (WIDE(n)) {
       wide_add(U, H, behind, J, k->S, !plain, o, nx, nw, np);
     } else if (plain) {
@@ -173,7 +173,7 @@ INLINE int backward_sized(core *k, const model *m, int from, int right_hand_side
     pull_back(q, behind, k->q + (size_t)((slot + 1) * n), J,
               right_hand_side ? NULL : m->c + (size_t)(slot * nx), k->v, plain, o, nx, nw, np);
     if (!calm) add_forces(k, J, U, q, slot, right_hand_side, nx, nw, np);
-    if (!right_hand_side) {
+    if (!known) {
       int outcome;
       if (plain && !WIDE(n)) {
         if (!calm) substitute(k, U, q, slot, eliminated, skip, nx, nw, np);
@@ -208,8 +208,11 @@ static int backward(core *k, const model *m, int from, int right_hand_side) {
   const int nx = NX(k->s), nw = NW(k->s), np = NP(k->s);
   if (right_hand_side) return np && k->np ? backward_sized(k, m, from, 1, 0, nx, nw, np)
                                           : backward_sized(k, m, from, 1, 0, nx, nw, 0);
-  if (k->calm) return np && k->np ? backward_sized(k, m, from, 0, 1, nx, nw, np) : backward_sized(k, m, from, 0, 1, nx, nw, 0);
-  return np && k->np ? backward_sized(k, m, from, 0, 0, nx, nw, np) : backward_sized(k, m, from, 0, 0, nx, nw, 0);
+  int status;
+  if (k->calm) status = np && k->np ? backward_sized(k, m, from, 0, 1, nx, nw, np) : backward_sized(k, m, from, 0, 1, nx, nw, 0);
+  else status = np && k->np ? backward_sized(k, m, from, 0, 0, nx, nw, np) : backward_sized(k, m, from, 0, 0, nx, nw, 0);
+  k->rebuilt = k->N;
+  return status;
 }
 
 /* Solve for `count` leading variables of v, those behind them known. */
