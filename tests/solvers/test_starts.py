@@ -35,8 +35,9 @@ def test_random_starts_end_at_the_best_cost(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SETTINGS)
 def test_in_99_of_100_starts_that_ipopt_survives_so_do_we(name):
-    """100 starts; IPOPT from the first three and from where ours misses the best cost."""
-    row = row_of(name, *run(name, 100, seed=1, asked=3, solver=solver_of(name, "core")), asked=3)
+    """100 starts (25 of the reactor in which IPOPT often fails slowly), IPOPT from three and from where ours misses."""
+    count = 25 if name == "cstr" else 100
+    row = row_of(name, *run(name, count, seed=1, asked=3, solver=solver_of(name, "core")), asked=3)
     assert row["share"] >= 0.99
     assert row["false"] == 0
 
