@@ -119,9 +119,7 @@ def tanks() -> Setting:
     model = cascaded_tanks(noise=False)
     cost = DiscountedCost(P=0.1, Q=1e4, R_point=1e2, eta=0.99)
     mhe = MHE(model, horizon=80.0, interval=4.0, integrator=RK4(1.0), cost=cost, bounds=model.bounds, hold="point")
-    return Setting(
-        mhe, [9.5, 6.0], [4.0, 3.0], [], [], lambda t: [4.5 + 2.0 * np.sign(np.sin(t / 20))], [0.1], 4.0
-    )
+    return Setting(mhe, [9.5, 6.0], [4.0, 3.0], [], [], lambda t: [4.5 + 2.0 * np.sign(np.sin(t / 20))], [0.1], 4.0)
 
 
 SETTINGS: dict[str, Callable[[], Setting]] = {
@@ -225,9 +223,7 @@ class Judge:
         """Return whether a solution has the lowest cost of all minima."""
         lowest = min((minimum.cost for minimum in self.minima), default=float("nan"))
         return bool(
-            solution is not None
-            and solution.success
-            and solution.cost - lowest <= REACHED * max(lowest, self.floor)
+            solution is not None and solution.success and solution.cost - lowest <= REACHED * max(lowest, self.floor)
         )
 
 

@@ -68,7 +68,7 @@ class Ipopt:
 
     def solve(self, window: Window, guess: Guess) -> Solution:
         """Return the solution from `guess`; never raises for numerical trouble."""
-        with self._lock:
+        with self._lock, np.errstate(all="ignore"):  # where it diverges, its cost may overflow
             return self._solve(window, guess)
 
     def _solve(self, window: Window, guess: Guess) -> Solution:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import tempfile
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import casadi as ca
@@ -44,12 +46,21 @@ def library(tmp_path_factory) -> Path:
 
 
 def build(target: Path, *flags: str, source: Path = SOURCE) -> Path:
-    """Compile the core, or what includes it, with `$CTMHE_CFLAGS` as the library would."""
+    """Compile the core, or what includes it, with `$CTMHE_CFLAGS` as the library would; the same once only."""
     if COMPILER is None:
         pytest.skip("no C compiler found ($CC, cc, gcc, clang)")
-    options = ["-O2", "-std=c99", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", *flags, *extra_flags()]
-    subprocess.run([COMPILER, *options, str(source), "-o", str(target), "-lm"], check=True)
+    target.write_bytes(compiled(COMPILER, source, *flags, *extra_flags()))
     return target
+
+
+@cache
+def compiled(compiler: str, source: Path, *flags: str) -> bytes:
+    """A library's content."""
+    options = ["-O2", "-std=c99", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", *flags]
+    with tempfile.TemporaryDirectory() as folder:
+        target = Path(folder) / "core.so"
+        subprocess.run([compiler, *options, str(source), "-o", str(target), "-lm"], check=True)
+        return target.read_bytes()
 
 
 def window_of(mhe: MHE, state, end: float) -> tuple[Window, Guess]:

@@ -20,7 +20,7 @@ UNSTABLE = (322, 552, 643, 655, 819, 975)  # starts of seed 0 from which IPOPT g
 def solver_of(name: str, kind: str):
     """A solver for a model of the benchmark; the core calls CasADi's virtual machine."""
     stage = SETTINGS[name]().mhe.stage
-    return compiled_solver(stage, specialise=False) if kind == "core" else GaussNewton(stage)
+    return compiled_solver(stage, specialise=False) if kind == "core" else GaussNewton(stage, max_iterations=100)
 
 
 @pytest.mark.parametrize("name", ["batch_reactor", "chua", "van_der_pol", "cascaded_tanks"])
@@ -35,8 +35,9 @@ def test_random_starts_end_at_the_best_cost(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SETTINGS)
 def test_in_99_of_100_starts_that_ipopt_survives_so_do_we(name):
-    """100 starts; IPOPT from the first three and from where ours misses the best cost."""
-    row = row_of(name, *run(name, 100, seed=1, asked=3, solver=solver_of(name, "core")), asked=3)
+    """100 starts (25 of the reactor in which IPOPT often fails slowly), IPOPT from three and from where ours misses."""
+    count = 25 if name == "cstr" else 100
+    row = row_of(name, *run(name, count, seed=1, asked=3, solver=solver_of(name, "core")), asked=3)
     assert row["share"] >= 0.99
     assert row["false"] == 0
 

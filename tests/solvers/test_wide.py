@@ -92,3 +92,16 @@ def test_every_size_gives_what_the_reference_gives(libraries, size, dense, share
         np.testing.assert_allclose(solution.multipliers.dynamics, python.multipliers.dynamics, atol=1e-4 * size_of)
     for key in ("x", "w", "p"):
         assert getattr(found["any"].point, key).tobytes() == getattr(found["baseline"].point, key).tobytes()
+
+
+@pytest.mark.parametrize("boxed", [False, True])
+@pytest.mark.parametrize("size", SIZES)
+def test_the_library_as_built_takes_every_size(size, boxed, rng, tmp_path):
+    """Without further flags: the reference's cost, with disturbances that slots share."""
+    nx, nw, n_p = size
+    stage = chain(nx, nw, n_p, dense=True)
+    window, guess = window_of(stage, 6, rng, boxed=boxed and nw > 0, shared=True)
+    python = GaussNewton(stage).solve(window, guess)
+    ours = CompiledGaussNewton(stage, build(tmp_path / "core.so"), tolerance=1e-12).solve(window, guess)
+    assert ours.success, ours.message
+    assert ours.cost == pytest.approx(python.cost, rel=1e-9)
