@@ -24,6 +24,16 @@
 #define BATCH CTMHE_BATCH
 #define POINTS(s) ((NQ(s) - 1) / (s)->steps + 1) /* output evaluations of one integration step */
 
+/* Work of one slot. Where sizes are constants and small: local arrays, which a compiler keeps in registers. */
+#if defined(CTMHE_NX) && CTMHE_NX + CTMHE_NW + CTMHE_NP > 0 && CTMHE_NX + CTMHE_NW + CTMHE_NP <= 8
+#define SLOT_SIZE (CTMHE_NX + CTMHE_NW + CTMHE_NP)
+#define WORK(name, memory) double name[SLOT_SIZE]
+#define SQUARE(name, memory) double name[SLOT_SIZE * SLOT_SIZE]
+#else
+#define WORK(name, memory) double *restrict name = (memory)
+#define SQUARE(name, memory) double *restrict name = (memory)
+#endif
+
 #if defined(__GNUC__)
 #define INLINE static inline __attribute__((always_inline))
 #else

@@ -154,12 +154,15 @@ INLINE int backward_sized(core *k, const model *m, int from, int right_hand_side
   }
   for (int slot = from; slot >= 0; slot--) {
     const int carried = shared[slot] && slot + 1 < N, first = slot == 0 || !shared[slot - 1], o = carried ? 0 : nw;
-    double *U = k->U + (size_t)slot * nn, *D = k->D + (size_t)(slot * n), *q = k->q + (size_t)(slot * n);
-    const double *behind = U + nn, *J = m->J + (size_t)(slot * (nx + nb)) * (size_t)n;
+    double *kept_U = k->U + (size_t)slot * nn, *D = k->D + (size_t)(slot * n), *kept_q = k->q + (size_t)(slot * n);
+    SQUARE(U, kept_U);
+    WORK(q, kept_q);
+    const double *behind = kept_U + nn, *J = m->J + (size_t)(slot * (nx + nb)) * (size_t)n;
     const double *g = m->g + (size_t)(slot * n), *H = m->H + (size_t)slot * nn;
     const int eliminated = slot == 0 ? n : first ? nw : 0, known = right_hand_side || (calm && slot > k->rebuilt);
     for (int i = 0; i < n; i++) q[i] = right_hand_side ? 0.0 : g[i];
     if (known) {
+      if (U != kept_U) copy(U, kept_U, nn);
     } else if (WIDE(n)) {
       wide_add(U, H, behind, J, k->S, !plain, o, nx, nw, np);
     } else if (plain) {
@@ -187,6 +190,10 @@ INLINE int backward_sized(core *k, const model *m, int from, int right_hand_side
       if (outcome) status = outcome;
     }
     forward_eliminate(q, U, D, eliminated, n, plain && !WIDE(n));
+    if (U != kept_U) {
+      for (int i = 0; i < n; i++) kept_q[i] = q[i];
+      for (int i = 0; i < n * n && !known; i++) kept_U[i] = U[i];
+    }
   }
   return status;
 }
@@ -227,7 +234,9 @@ INLINE void back_substitute(double *restrict v, const double *restrict U, const 
 INLINE void forward_sized(core *k, const model *m, int correction, int nx, int nw, int np) {
   const int n = nw + nx + np, N = k->N, nb = k->nb;
   const uint8_t *shared = k->win->shared;
-  double *restrict v = k->v, *restrict next = k->t, *d = k->d;
+  double *d = k->d;
+  WORK(v, k->v);
+  WORK(next, k->t);
   for (int slot = 0; slot < N; slot++) {
     const double *U = k->U + (size_t)slot * (size_t)(n * n), *D = k->D + (size_t)(slot * n),
                  *q = k->q + (size_t)(slot * n);
@@ -281,8 +290,13 @@ INLINE void adjoint_sized(core *k, const model *m, int nx, int nw, int np) {
   const int n = nw + nx + np, N = k->N, nb = k->nb;
   const uint8_t *shared = k->win->shared;
   const int held = k->bounded && !k->calm;
-  double *restrict v = k->v, *restrict r = k->r, *restrict Hv = k->t;
-  double *rw = k->S, *rp = k->S + nw, *Hp = k->S + nw + np, *gp = k->S + nw + 2 * np;
+  WORK(v, k->v);
+  WORK(r, k->r);
+  WORK(Hv, k->t);
+  WORK(rw, k->S);
+  WORK(rp, k->S + n);
+  WORK(Hp, k->S + 2 * n);
+  WORK(gp, k->S + 3 * n);
   const double *d = k->d;
   double slope = 0.0, curvature = 0.0, largest = 0.0, product = 0.0, residual = 0.0, force = 0.0;
   for (int i = 0; i < nw; i++) rw[i] = 0.0;
