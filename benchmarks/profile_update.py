@@ -33,8 +33,10 @@ COUNTING = """
 #include <string.h>
 typedef int (*casadi)(const double **, double **, long long *, double *, int);
 typedef void (*buffer)(void *);
+typedef int (*batch)(const void *, int);
 casadi function_NAME;
 buffer eval_NAME;
+batch batch_NAME;
 int times_NAME = 1;
 long long calls_NAME;
 volatile long long nothing_NAME = 0;
@@ -55,6 +57,13 @@ int repeated_function_NAME(const double **arg, double **res, long long *iw, doub
   return function_NAME(given, res, iw, w, mem);
 }
 
+int repeated_batch_NAME(const void *calls, int lanes) {
+  calls_NAME += lanes;
+  for (int i = 1; i < times_NAME; i++)
+    if (batch_NAME(calls, lanes)) return 1;
+  return batch_NAME(calls, lanes);
+}
+
 void repeated_eval_NAME(void *self) {
   calls_NAME++;
   for (int i = 0; i < times_NAME; i++) eval_NAME(self);
@@ -70,7 +79,7 @@ class Repeated:
         self.library = ctypes.CDLL(str(build_library(f"repeated-{name}", [Source(f"{name}.c", text)])))
         self.times = ctypes.c_int.in_dll(self.library, f"times_{name}")
         self.calls = ctypes.c_longlong.in_dll(self.library, f"calls_{name}")
-        kind = "function" if structure.function else "eval"
+        kind = next(kind for kind in ("batch", "function", "eval") if getattr(structure, kind))
         ctypes.c_void_p.in_dll(self.library, f"{kind}_{name}").value = getattr(structure, kind)
         wrapper = getattr(self.library, f"repeated_{kind}_{name}")
         setattr(structure, kind, ctypes.cast(wrapper, ctypes.c_void_p).value)
@@ -158,7 +167,7 @@ def inside(problem: Problem, updates: int, options: dict[str, Any]) -> tuple[dic
     """Return the median seconds of parts of the core, and the mean numbers of evaluations."""
     run = Run(problem, options)
     stage = run.memory.functions.structure
-    kinds = ("function", "eval", "tape")
+    kinds = ("batch", "function", "eval", "tape")
     there = [name for name in FUNCTIONS if any(getattr(getattr(stage, name), kind) for kind in kinds)]
     functions = {FUNCTIONS[name]: repeated(getattr(stage, name), name) for name in there}
     rows, counts = [], []

@@ -233,7 +233,7 @@ def run(
     """Return the trials of one model; IPOPT solves the first `asked` (default: all) and those that ours misses."""
     setting = SETTINGS[name]()
     window, stage = window_of(setting, seed), setting.mhe.stage
-    solver = solver or compiled_solver(stage, specialise=True)
+    solver = solver or compiled_solver(stage, specialise=True, p_estimated=window.p_estimated)
     if solver is None:
         raise SystemExit("the compiled core is needed: install a C compiler")
     judge, trials = Judge(window, stage), list[Trial]()

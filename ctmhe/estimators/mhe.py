@@ -212,7 +212,8 @@ class MHE:
         self._solver: Solver = self._reference if solver == "ipopt" else self._gauss_newton
         compiled = None
         if solver == "gauss-newton":
-            compiled = compiled_solver(self.stage, specialise=compile == "auto", **limits)
+            choice = {"specialise": compile == "auto", "p_estimated": self.assembly.p_estimated}
+            compiled = compiled_solver(self.stage, **choice, **limits)
             self._solver = compiled or self._gauss_newton
         self._covariance = (compiled or self._gauss_newton).covariance
         self._layout = Layout.of(self.stage)

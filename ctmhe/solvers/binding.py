@@ -16,7 +16,7 @@ from ctmhe.errors import SolverError
 from ctmhe.solvers.tape import BATCH, tape_of
 from ctmhe.transcription.stage import StageFunction
 
-VERSION = 5
+VERSION = 6
 MAX_ARGUMENTS = 64
 CONVERGED, ITERATION_LIMIT, NOT_FINITE, NO_DECREASE, SINGULAR, DEADLINE = range(6)
 STAGE_FUNCTIONS = ("ctmhe_stage_value", "ctmhe_stage_jacobian", "ctmhe_stage_curvature")
@@ -32,8 +32,8 @@ class Function(ctypes.Structure):
     """A stage function and its memory."""
 
     _fields_ = [
-        ("function", _pointer), ("iw", _pointer), ("w", _pointer), ("tape", _pointer), ("constants", _pointer),
-        ("registers", _pointer), ("tape_length", _int), ("eval", _pointer), ("self", _pointer), ("failed", _pointer),
+        *((name, _pointer) for name in ("batch", "function", "iw", "w", "tape", "constants", "registers")),
+        ("tape_length", _int), ("sizes", _int * 3), ("eval", _pointer), ("self", _pointer), ("failed", _pointer),
         ("arg", _pointer * 9), ("res", _pointer * 3),
     ]  # fmt: skip
 
@@ -137,11 +137,14 @@ class Functions:
         functions = [group[1] for group in stage.mapped]
         structures = []
         for name, function in zip(STAGE_FUNCTIONS, functions, strict=False):
-            exported = getattr(core, name, None)
-            if exported is not None:
+            batch = getattr(core, name.replace("_stage_", "_batch_"), None)
+            if batch is not None:
+                structures.append(Function(batch=ctypes.cast(batch, ctypes.c_void_p).value))
+            elif getattr(core, name, None) is not None:
                 structures.append(self._compiled(core, name))
-            else:
-                structures.append(self._taped(function) or self._virtual(stage, function))
+            else:  # second derivatives are rarely asked for, and long to read
+                taped = None if name == STAGE_FUNCTIONS[2] else self._taped(function)
+                structures.append(taped or self._virtual(stage, function))
         sizes = (stage.nx, stage.nw, stage.np, stage.nu, stage.ny, stage.q, stage.steps)
         self.structure = Stage(*sizes, stage.step_length, bool(stage.symbolic), *structures)
 
@@ -168,6 +171,7 @@ class Functions:
             constants=tape.constants.ctypes.data,
             registers=-(-registers.ctypes.data // 64) * 64,
             tape_length=len(tape.instructions),
+            sizes=(_int * 3)(*tape.sparse),
         )
 
     def _virtual(self, stage: StageFunction, function: ca.Function) -> Function:

@@ -15,19 +15,20 @@ import casadi as ca
 
 from ctmhe.errors import SolverError
 from ctmhe.solvers.compilers import NATIVE, Source, build_library, extra_flags, find_compiler
+from ctmhe.solvers.tape import Tape, tape_of, written_in_c
 from ctmhe.transcription.stage import StageFunction
 
 logger = logging.getLogger(__name__)
 
 CORE = Path(__file__).parent / "core"
-LARGE = 10_000  # instructions of a function from which compiling with -O3 takes longer than it is worth
+GENERATOR = Path(__file__).parent / "tape.py"
+LARGE = 6_000  # instructions from which compiling a function takes longer than it is worth: its tape is run
 
-# Of the core. For few states, vectorised loops only cost; for many, -O3 is 4 percent faster than this and takes twice
-# as long to compile.
+# Of the core. For few states, vectorised loops only cost; for many, the kernels bring their own vectors, and -O3 takes
+# twice as long to compile and makes nothing faster.
 ANY_SIZE = ("-O2",)
 SMALL = ("-O3", "-fno-tree-vectorize")
-WIDE = ("-O2", "-ftree-vectorize")
-WIDE_GNU = (*WIDE, "-fvect-cost-model=dynamic")
+WIDE = ("-O2",)
 WIDE_FROM = 8  # states
 
 # CasADi functions that become plain C without memory of their own; others call libraries or Python
@@ -68,11 +69,14 @@ def shipped_core() -> Path | None:
     return _compiled("core", [Source("core.c", source.read_text(), ANY_SIZE)], digest)
 
 
-def specialised_core(stage: StageFunction) -> Path | None:
+def specialised_core(stage: StageFunction, p_estimated: bool) -> Path | None:
     """Return a library of the core and the stage function, with the sizes as constants, compiled at most once.
 
-    It exports what the core exports and `ctmhe_stage_value`, `ctmhe_stage_jacobian` and, for symbolic models,
-    `ctmhe_stage_curvature`, in CasADi's calling convention and each with its `_work`. The result is cached under what
+    It is for windows in which the parameters are estimated, or for those in which they are held.
+
+    It exports what the core exports, `ctmhe_batch_value` and `ctmhe_batch_jacobian`, which take several slots at once,
+    and `ctmhe_stage_curvature` in CasADi's calling convention with its `_work`; `ctmhe_stage_value` and
+    `ctmhe_stage_jacobian` take their place for models of other expressions. The result is cached under what
     determines it: the functions, the sizes, the core's sources, the compiler, its flags and CasADi's version; code is
     generated only when it is not found.
 
@@ -85,6 +89,7 @@ def specialised_core(stage: StageFunction) -> Path | None:
     functions = {"value": stage.value, "jacobian": stage.derivative}
     if stage.symbolic:
         functions["curvature"] = stage.mapped[2][1]
+    taped = stage.symbolic and stage.derivative.n_instructions() > LARGE
     for function in functions.values():
         reason = _not_generated(function)
         if reason is not None:
@@ -93,15 +98,24 @@ def specialised_core(stage: StageFunction) -> Path | None:
     compiler = find_compiler()
     if compiler is None or not (CORE / "core.c").is_file():
         return None
-    flags = SMALL if stage.nx < WIDE_FROM else WIDE_GNU if compiler.gnu else WIDE
+    flags = SMALL if stage.nx < WIDE_FROM else WIDE
     native = NATIVE if "zig" not in compiler.identity else ()  # which zig takes without being told
     sizes = {"NX": stage.nx, "NW": stage.nw, "NP": stage.np, "NU": stage.nu, "NY": stage.ny, "NQ": stage.q}
+    sizes["P"] = int(p_estimated)
+    if taped:
+        sizes["TAPE"] = 1
     digest = sha256(f"{core_digest()}{ca.CasadiMeta.version()}\n{flags, native, LARGE}\n".encode())
+    digest.update(GENERATOR.read_bytes())
     for name, function in functions.items():
         digest.update(f"{name}\n{function.serialize()}\n".encode())
 
     def sources() -> list[Source]:
-        return [*_generate(functions), Source("core.c", (CORE / "core.c").read_text(), flags)]
+        if taped:
+            return [Source("core.c", (CORE / "core.c").read_text(), flags)]
+        taken = {key: tape_of(functions[key]) for key in ("value", "jacobian")}
+        tapes = {key: tape for key, tape in taken.items() if tape is not None}
+        rest = {key: function for key, function in functions.items() if key not in tapes}
+        return [*_batches(tapes), *_generate(rest), Source("core.c", (CORE / "core.c").read_text(), flags)]
 
     defines = {f"CTMHE_{name}": size for name, size in sizes.items()}
     return _compiled("stage", sources, digest.hexdigest(), defines, native)
@@ -167,6 +181,14 @@ def _generate(functions: dict[str, ca.Function]) -> list[Source]:
             flags = ("-O1",) if large or keys == curvature else ()
             sources.append(Source(name, _code(name, (_renamed(functions[key], key) for key in keys)), flags))
     return sources
+
+
+def _batches(tapes: dict[str, Tape]) -> list[Source]:
+    """Return the C of functions that take several slots at once, named ctmhe_batch_<key>."""
+    if not tapes:
+        return []
+    text = "".join(written_in_c(tape, f"ctmhe_batch_{key}") for key, tape in tapes.items())
+    return [Source("batch.c", f'#include "tape.h"\n{text}', ("-O2",))]
 
 
 def _code(name: str, functions: Iterable[ca.Function]) -> str:

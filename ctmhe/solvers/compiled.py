@@ -149,9 +149,11 @@ class CompiledGaussNewton:
         }[stop]
 
 
-def compiled_solver(stage: StageFunction, *, specialise: bool, **limits: Any) -> CompiledGaussNewton | None:
+def compiled_solver(
+    stage: StageFunction, *, specialise: bool, p_estimated: bool = False, **limits: Any
+) -> CompiledGaussNewton | None:
     """Return the solver in the core, if wished compiled for `stage`; None, with the reason logged, without any."""
-    library = (specialised_core(stage) if specialise else None) or shipped_core()
+    library = (specialised_core(stage, p_estimated) if specialise else None) or shipped_core()
     if library is None:
         logger.info("no compiled core: neither a built one nor a C compiler was found")
         return None

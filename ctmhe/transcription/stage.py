@@ -82,15 +82,16 @@ class StageFunction:
         x_next, y = step(*symbols)
         x_next, y = ca.densify(x_next), ca.densify(ca.vec(y))
         jacobian = ca.densify(ca.jacobian(ca.vertcat(x_next, y), ca.vertcat(*symbols[2:5])))
-        self.value = ca.Function("stage", symbols, [x_next, y])
-        self.derivative = ca.Function("stage_jacobian", symbols, [x_next, y, jacobian])
+        shared: Any = ca.cse if symbolic else list  # what occurs twice in scalar expressions is computed once
+        self.value = ca.Function("stage", symbols, shared([x_next, y]))
+        self.derivative = ca.Function("stage_jacobian", symbols, shared([x_next, y, jacobian]))
         self.symbolic = symbolic
         functions = [self.value, self.derivative]
         if symbolic:  # second derivatives of dot(lambda_x, x_next) + dot(lambda_y, y)
             duals = [kind.sym("lambda_x", self.nx), kind.sym("lambda_y", y.numel())]
             lagrangian = ca.dot(duals[0], x_next) + ca.dot(duals[1], y)
             hessian, _ = ca.hessian(lagrangian, ca.vertcat(*symbols[2:5]))
-            functions.append(ca.Function("stage_curvature", symbols + duals, [ca.densify(hessian)]))
+            functions.append(ca.Function("stage_curvature", symbols + duals, shared([ca.densify(hessian)])))
         self.mapped = [{size: function.map(size) for size in CHUNKS} for function in functions]
         self._local = local()
 

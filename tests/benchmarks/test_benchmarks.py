@@ -113,5 +113,5 @@ def test_the_profile_accounts_for_an_update_without_changing_it(compile, capsys)
     for k in (1, 2, 3):
         plain.update(k), slowed.update(k)
         assert plain.state.window.blocks == slowed.state.window.blocks
-    if compile == "auto" and stage.jacobian.function:
+    if compile == "auto" and stage.jacobian.batch:
         assert functions[1].calls.value >= 3 * problem.count

@@ -178,7 +178,7 @@ def test_without_a_compiler_nothing_is_compiled(monkeypatch, caplog, reactor, tm
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setattr(compilers, "version", _not_installed)
     with caplog.at_level(logging.INFO):
-        assert find_compiler() is None and specialised_core(reactor) is None
+        assert find_compiler() is None and specialised_core(reactor, False) is None
     assert sum("ctmhe[compile]" in record.message for record in caplog.records) == 1
     with pytest.raises(SolverError, match="no C compiler"):
         build_library("answer", ANSWER)
@@ -203,11 +203,10 @@ def test_cc_names_the_compiler_and_its_arguments(monkeypatch, caplog):
 
 @needs_compiler
 def test_the_compiled_stage_is_the_stage(reactor, runs, rng):
-    """Compiled value, Jacobian and curvature equal CasADi's to rounding; the sizes are those of the stage."""
-    library = specialised_core(reactor)
+    """The compiled second derivatives equal CasADi's to rounding; the sizes are those of the stage."""
+    library = specialised_core(reactor, False)
     assert library is not None
-    functions = {"value": reactor.value, "jacobian": reactor.derivative, "curvature": reactor.mapped[2][1]}
-    for name, function in functions.items():
+    for name, function in {"curvature": reactor.mapped[2][1]}.items():
         arguments = [rng.uniform(0.1, 1.0, function.size1_in(i)) for i in range(function.n_in())]
         expected = function.call(arguments)
         for result, value in zip(evaluate(library, f"ctmhe_stage_{name}", function, arguments), expected, strict=True):
@@ -217,18 +216,18 @@ def test_the_compiled_stage_is_the_stage(reactor, runs, rng):
     assert [size.value for size in sizes[:5]] == [reactor.nx, reactor.nw, reactor.np, reactor.ny, reactor.q]
     done = len(runs)
     again = StageFunction(batch_reactor(), RK4(0.05), signal=False)
-    assert specialised_core(again) == library and len(runs) == done
+    assert specialised_core(again, False) == library and len(runs) == done
 
 
 @needs_compiler
 def test_another_process_finds_the_compiled_stage_without_generating_code(reactor):
     """The key is the same in every process, so that the second finds the library and neither generates nor compiles."""
-    library = specialised_core(reactor)
+    library = specialised_core(reactor, False)
     code = (
         "from ctmhe.models.library import batch_reactor; from ctmhe.solvers import codegen, compilers\n"
         "from ctmhe.transcription import RK4; from ctmhe.transcription.stage import StageFunction\n"
         "codegen._generate = compilers._run = None\n"
-        "print(codegen.specialised_core(StageFunction(batch_reactor(), RK4(0.05), signal=False)))"
+        "print(codegen.specialised_core(StageFunction(batch_reactor(), RK4(0.05), signal=False), False))"
     )
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert answer.stdout.strip() == str(library)
@@ -256,8 +255,8 @@ def test_models_beyond_plain_c_are_left_to_the_virtual_machine(caplog, runs):
         lambda t, x, u, w, p: outside(x) + w, lambda t, x, u, w, p: x, x=["x"], w=["w"], y=["y"]
     )
     with caplog.at_level(logging.INFO, logger=codegen.__name__):
-        assert specialised_core(StageFunction(van_der_pol(), CVODES(), signal=False)) is None
-        assert specialised_core(StageFunction(black_box, RK4(0.1), signal=False)) is None
+        assert specialised_core(StageFunction(van_der_pol(), CVODES(), signal=False), False) is None
+        assert specialised_core(StageFunction(black_box, RK4(0.1), signal=False), False) is None
     assert "CvodesInterface" in caplog.text and "outside" in caplog.text and not runs
 
 

@@ -64,7 +64,7 @@ def test_a_run_in_the_compiled_core_equals_the_run_in_numpy(case):
 
 def test_without_a_core_the_numpy_solver_takes_over(monkeypatch):
     """No built library and no compiler: compile="auto" still estimates."""
-    monkeypatch.setattr("ctmhe.solvers.compiled.specialised_core", lambda stage: None)
+    monkeypatch.setattr("ctmhe.solvers.compiled.specialised_core", lambda stage, p_estimated: None)
     monkeypatch.setattr("ctmhe.solvers.compiled.shipped_core", lambda: None)
     mhe = MHE(batch_reactor(), horizon=1.0, interval=0.1, integrator=RK4(0.1), cost=REACTOR_COST, compile="auto")
     assert mhe._solver.name == "Gauss-Newton"

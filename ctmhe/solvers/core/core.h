@@ -17,7 +17,7 @@
 extern "C" {
 #endif
 
-#define CTMHE_CORE_VERSION 5
+#define CTMHE_CORE_VERSION 6
 #define CTMHE_BATCH 8          /* slots that a tape is run for at once */
 #define CTMHE_MAX_ARGUMENTS 64 /* pointers a compiled stage function may use (CasADi's sz_arg, sz_res) */
 
@@ -32,18 +32,29 @@ typedef int (*ctmhe_casadi)(const double **arg, double **res, long long *iw, dou
 /* CasADi's evaluation buffer (the VM): eval(self) reads and writes memory bound beforehand. */
 typedef void (*ctmhe_buffer_eval)(void *self);
 
+typedef struct {              /* arguments and results of one step, in that order */
+  const double *arg[9];
+  double *res[3];
+  double t, h;
+} ctmhe_call;
+
+/* The same for up to CTMHE_BATCH steps at once: what tape.py writes for models of scalar expressions. */
+typedef int (*ctmhe_batch)(const ctmhe_call *calls, int lanes);
+
 typedef struct {
   int32_t operation, target, left, right; /* see tape.h */
 } ctmhe_instruction;
 
 typedef struct {
-  ctmhe_casadi function;      /* compiled function, or NULL */
+  ctmhe_batch batch;          /* compiled function for several steps, or NULL */
+  ctmhe_casadi function;      /* else for one, or NULL */
   long long *iw;              /* its work vectors */
   double *w;
   const ctmhe_instruction *tape; /* else its instructions, or NULL */
   const double *constants;
   double *registers;          /* CTMHE_BATCH each, aligned to 64 bytes */
   int tape_length;
+  int sizes[3];               /* of results with elements that the tape leaves out: they are zero */
   ctmhe_buffer_eval eval;     /* else the VM's buffer */
   void *self;
   const int *failed;          /* set by the VM's wrapper when an evaluation failed; may be NULL */

@@ -2,10 +2,7 @@
 #ifndef CTMHE_LAYOUT_H
 #define CTMHE_LAYOUT_H
 
-#include "core.h"
-
-#include <math.h>
-#include <string.h>
+#include "tape.h"
 
 #ifdef CTMHE_NX
 #define NX(s) ((void)(s), CTMHE_NX)
@@ -21,7 +18,11 @@
 #define NQ(s) ((s)->q)
 #endif
 
-#define BATCH CTMHE_BATCH
+#ifdef CTMHE_P /* whether parameters are estimated, where that is known: half as much to compile */
+#define ESTIMATED(k) (CTMHE_NP && CTMHE_P)
+#else
+#define ESTIMATED(k) (NP((k)->s) && (k)->np)
+#endif
 #define POINTS(s) ((NQ(s) - 1) / (s)->steps + 1) /* output evaluations of one integration step */
 
 /* Work of one slot. Where sizes are constants and small: local arrays, which a compiler keeps in registers. */
@@ -32,12 +33,6 @@
 #else
 #define WORK(name, memory) double *restrict name = (memory)
 #define SQUARE(name, memory) double *restrict name = (memory)
-#endif
-
-#if defined(__GNUC__)
-#define INLINE static inline __attribute__((always_inline))
-#else
-#define INLINE static inline
 #endif
 
 #define ARMIJO 1e-4
@@ -160,6 +155,9 @@ static void lay_out_memo(memo *m, arena *memory, const ctmhe_stage *s, size_t N)
   if (memory->at) *m = found;
 }
 
+/* Slots that a function takes at once. */
+static int lanes_of(const ctmhe_function *f) { return f->batch || f->tape ? BATCH : 1; }
+
 /* Doubles of work for one integration step, and for the second derivatives of a slot: see slot.h. */
 static size_t step_work_size(const ctmhe_stage *s, int derivatives) {
   const size_t nx = (size_t)NX(s), outputs = (size_t)(POINTS(s) * NY(s)), n0 = nx + (size_t)(NW(s) + NP(s));
@@ -213,7 +211,7 @@ static size_t lay_out(core *k, char *scratch, const ctmhe_stage *s, int slots, i
   k->barrier_spring = DOUBLES(&memory, k->nf);
   k->barrier_force = DOUBLES(&memory, 3 * k->nf); /* and the centring terms */
   k->lambda = DOUBLES(&memory, N * nx);
-  const size_t lanes = s->jacobian.tape ? BATCH : 1;
+  const size_t lanes = (size_t)lanes_of(&s->jacobian);
   k->lane = DOUBLES(&memory, lanes * (nx + qy + (nx + qy) * n0));
   k->steps = DOUBLES(&memory, s->steps > 1 ? lanes * step_work_size(s, 1) : 0);
   k->second = DOUBLES(&memory, curvature_work_size(s));

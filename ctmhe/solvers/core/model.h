@@ -86,7 +86,7 @@ INLINE int linearize_sized(core *k, model *m, int with_jacobian, int nx, int nw,
       r += win->L_prior[i * width + j] * ((j < nx ? m->x[j] : m->p[j - nx]) - win->prior[j]);
     total += r * r;
   }
-  const int lanes = f->tape ? BATCH : 1, qy = q * ny, lane_size = nx + qy + (nx + qy) * (nx + nw + all);
+  const int lanes = lanes_of(f), qy = q * ny, lane_size = nx + qy + (nx + qy) * (nx + nw + all);
   const int direct = f->function && s->steps == 1;
   for (int slot = 0; slot < N; slot++) {
     const int lane = slot % lanes;
@@ -218,11 +218,13 @@ INLINE int linearize_sized(core *k, model *m, int with_jacobian, int nx, int nw,
 }
 
 static int linearize(core *k, model *m) {
-  if (NP(k->s) && k->np) return linearize_sized(k, m, 1, NX(k->s), NW(k->s), NP(k->s));
+  if (ESTIMATED(k)) return linearize_sized(k, m, 1, NX(k->s), NW(k->s), NP(k->s));
   return linearize_sized(k, m, 1, NX(k->s), NW(k->s), 0);
 }
 
-static int assess(core *k, model *m) { return linearize_sized(k, m, 0, NX(k->s), NW(k->s), k->np); }
+static int assess(core *k, model *m) {
+  return linearize_sized(k, m, 0, NX(k->s), NW(k->s), ESTIMATED(k) ? NP(k->s) : 0);
+}
 
 /* Add the second derivatives of the Lagrangian to H. */
 static int add_curvature(core *k, model *m) {

@@ -213,11 +213,11 @@ static int any_held(const core *k) {
 
 static int backward(core *k, const model *m, int from, int right_hand_side) {
   const int nx = NX(k->s), nw = NW(k->s), np = NP(k->s);
-  if (right_hand_side) return np && k->np ? backward_sized(k, m, from, 1, 0, nx, nw, np)
-                                          : backward_sized(k, m, from, 1, 0, nx, nw, 0);
+  if (right_hand_side) return ESTIMATED(k) ? backward_sized(k, m, from, 1, 0, nx, nw, np)
+                                           : backward_sized(k, m, from, 1, 0, nx, nw, 0);
   int status;
-  if (k->calm) status = np && k->np ? backward_sized(k, m, from, 0, 1, nx, nw, np) : backward_sized(k, m, from, 0, 1, nx, nw, 0);
-  else status = np && k->np ? backward_sized(k, m, from, 0, 0, nx, nw, np) : backward_sized(k, m, from, 0, 0, nx, nw, 0);
+  if (k->calm) status = ESTIMATED(k) ? backward_sized(k, m, from, 0, 1, nx, nw, np) : backward_sized(k, m, from, 0, 1, nx, nw, 0);
+  else status = ESTIMATED(k) ? backward_sized(k, m, from, 0, 0, nx, nw, np) : backward_sized(k, m, from, 0, 0, nx, nw, 0);
   k->rebuilt = k->N;
   return status;
 }
@@ -237,6 +237,7 @@ INLINE void forward_sized(core *k, const model *m, int correction, int nx, int n
   double *d = k->d;
   WORK(v, k->v);
   WORK(next, k->t);
+  for (int i = 0; i < n; i++) v[i] = 0.0;
   for (int slot = 0; slot < N; slot++) {
     const double *U = k->U + (size_t)slot * (size_t)(n * n), *D = k->D + (size_t)(slot * n),
                  *q = k->q + (size_t)(slot * n);
@@ -278,9 +279,9 @@ INLINE void forward_sized(core *k, const model *m, int correction, int nx, int n
 
 static void forward(core *k, const model *m, int correction) {
   if (correction) {
-    if (NP(k->s) && k->np) forward_sized(k, m, 1, NX(k->s), NW(k->s), NP(k->s));
+    if (ESTIMATED(k)) forward_sized(k, m, 1, NX(k->s), NW(k->s), NP(k->s));
     else forward_sized(k, m, 1, NX(k->s), NW(k->s), 0);
-  } else if (NP(k->s) && k->np) forward_sized(k, m, 0, NX(k->s), NW(k->s), NP(k->s));
+  } else if (ESTIMATED(k)) forward_sized(k, m, 0, NX(k->s), NW(k->s), NP(k->s));
   else forward_sized(k, m, 0, NX(k->s), NW(k->s), 0);
 }
 
@@ -383,7 +384,7 @@ INLINE void adjoint_sized(core *k, const model *m, int nx, int nw, int np) {
 }
 
 static void adjoint(core *k, const model *m) {
-  if (NP(k->s) && k->np) adjoint_sized(k, m, NX(k->s), NW(k->s), NP(k->s));
+  if (ESTIMATED(k)) adjoint_sized(k, m, NX(k->s), NW(k->s), NP(k->s));
   else adjoint_sized(k, m, NX(k->s), NW(k->s), 0);
 }
 

@@ -3,10 +3,11 @@
 #ifndef CTMHE_SLOT_H
 #define CTMHE_SLOT_H
 
-#include "tape.h"
+#include "layout.h"
 
 /* Evaluate a function of one step for some slots at once. Returns nonzero on failure. */
 static int call_step(const ctmhe_stage *s, const ctmhe_function *f, const call *calls, int lanes, int results) {
+  if (f->batch) return f->batch(calls, lanes);
   if (f->tape) return run_tape(f, calls, lanes);
   if (f->function) {
     const double *given[CTMHE_MAX_ARGUMENTS];

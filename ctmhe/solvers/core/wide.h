@@ -23,6 +23,9 @@ INLINE double dot(double start, const double *a, const double *b, int from, int 
   return n < WIDE_FROM ? start : start + more + (third + fourth);
 }
 
+#if defined(CTMHE_NX) && CTMHE_NX + CTMHE_NW + CTMHE_NP < WIDE_FROM
+#define CTMHE_NARROW
+#endif
 #if defined(__GNUC__) && !defined(CTMHE_NARROW) /* which stands for a compiler without vectors */
 #define WIDE(n) ((n) >= WIDE_FROM)
 
@@ -106,6 +109,7 @@ INLINE void list_rows(int *list, int *entries, const double *J, int nx, int n) {
   }
 }
 
+#ifndef __AVX2__
 #define BYTES 16
 #define FOR
 #define NAME(x) x##_16
@@ -113,8 +117,9 @@ INLINE void list_rows(int *list, int *entries, const double *J, int nx, int n) {
 #undef BYTES
 #undef FOR
 #undef NAME
+#endif
 
-#if defined(__x86_64__) && !defined(__clang__) && !defined(CTMHE_BASELINE)
+#if defined(__AVX2__) || defined(__x86_64__) && !defined(__clang__) && !defined(CTMHE_BASELINE)
 #define BYTES 32
 #define FOR __attribute__((target("avx2")))
 #define NAME(x) x##_32
@@ -122,7 +127,11 @@ INLINE void list_rows(int *list, int *entries, const double *J, int nx, int n) {
 #undef BYTES
 #undef FOR
 #undef NAME
+#ifdef __AVX2__
+#define CHOOSE(kernel) kernel##_32
+#else
 #define CHOOSE(kernel) (__builtin_cpu_supports("avx2") ? kernel##_32 : kernel##_16)
+#endif
 #else
 #define CHOOSE(kernel) kernel##_16
 #endif
