@@ -205,23 +205,20 @@ def resident() -> int:
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
-class Reading:
-    """The memory and the libraries of this process at one update."""
-
-    def __init__(self, update: int):
-        gc.collect()
-        folder = cache_directory()
-        self.update, self.bytes, self.objects = update, resident(), len(gc.get_objects())
-        self.libraries = len(list(folder.glob("*.json"))) if folder else 0
+def reading(update: int) -> tuple[int, int, int, int]:
+    """Return an update's number, and this process's resident bytes, Python objects and libraries compiled by then."""
+    gc.collect()
+    folder = cache_directory()
+    return update, resident(), len(gc.get_objects()), len(list(folder.glob("*.json"))) if folder else 0
 
 
 def endure(updates: int, compile: str) -> list[Row]:
     """Return the rows of one long run."""
     mhe = reactor(compile)
     times, y, x, period = samples(mhe)
-    state, settled = mhe.init(x=x), min(SETTLED, updates // POINTS)
-    stops = {settled, *(updates * (i + 1) // POINTS for i in range(POINTS))}
-    readings, seconds, slots, bad, moved, memory = [Reading(0)], [], 0, 0, 0, None
+    state, settled = mhe.init(x=x), min(SETTLED, max(updates // POINTS, 1))
+    stops = {settled, *(k for k in (updates * (i + 1) // POINTS for i in range(POINTS)) if k > settled)}
+    readings, seconds, slots, bad, moved, memory = [reading(0)], [], 0, 0, 0, None
     began, spent = time.perf_counter(), 0.0
     for k in tqdm(range(1, updates + 1), "endurance", mininterval=2.0):
         laps, i = divmod(k - 1, len(times))
@@ -236,22 +233,22 @@ def endure(updates: int, compile: str) -> list[Row]:
         if k in stops:
             spent += time.perf_counter() - began
             seconds.append((k, spent))
-            readings.append(Reading(k))
+            readings.append(reading(k))
             began = time.perf_counter()
-    counted = [reading for reading in readings if reading.update >= settled]
-    at, size = np.array([(reading.update, reading.bytes) for reading in counted], float).T
-    early, late = readings[1], readings[-1]
+    compiled = readings[-1][3] - readings[0][3]
+    at, size, objects, _ = np.array(readings[1:], float).T
+    slope = np.polyfit(at, size, 1)[0] if len(at) > 1 else 0.0
     tenths = [rate(seconds, 0, updates // 10), rate(seconds, updates - updates // 10, updates)]
     kind = "reactor"
-    every = sorted({*range(0, len(counted), max(1, POINTS // 5)), len(counted) - 1})
+    shown = [*range(0, len(at) - 1, POINTS // 5), -1]
     return [
         row("endurance", kind, "updates", updates, ""),
         row("endurance", kind, "slots of a window, mean", slots / updates, ""),
         row("endurance", kind, "updates not solved by the first rung", bad, ""),
-        *(row("endurance", kind, f"resident after {counted[i].update} updates", size[i] / 2**20, "MiB") for i in every),
-        row("endurance", kind, "resident, slope", np.polyfit(at, size, 1)[0], "bytes an update", 1.0),
-        row("endurance", kind, "Python objects, growth", late.objects - early.objects, "", 0.0),
-        row("endurance", kind, "libraries compiled during the run", late.libraries - readings[0].libraries, "", 0.0),
+        *(row("endurance", kind, f"resident after {at[i]:.0f} updates", size[i] / 2**20, "MiB") for i in shown),
+        row("endurance", kind, "resident, slope", slope, "bytes an update", 1.0),
+        row("endurance", kind, "Python objects, growth", objects[-1] - objects[0], "", 0.0),
+        row("endurance", kind, "libraries compiled during the run", compiled, "", 0.0),
         row("endurance", kind, "IPOPT programs built", mhe._reference.built, "", 0.0),
         row("endurance", kind, "the core's memory, allocated anew", moved, "", 0.0),
         row("endurance", kind, "time in the first tenth", 1e6 * tenths[0], "us an update"),
@@ -284,7 +281,8 @@ def memory(problems: Sequence[str]) -> Iterator[Row]:
         room = mhe._updates._memory()
         size, stage = mhe._updates.solver.core.ctmhe_update_size, ctypes.addressof(room.functions.structure)
         sizes = np.array([size(stage, n) for n in SLOTS], float)
-        yield row("memory", name, f"scratch for its own {problem.count} slots", size(stage, problem.count) / 1024, "KiB")
+        own = size(stage, problem.count) / 1024
+        yield row("memory", name, f"scratch for its own {problem.count} slots", own, "KiB")
         for n, value in zip(SLOTS, sizes, strict=True):
             yield row("memory", name, f"scratch a slot, N = {n}", value / n, "bytes")
         slope = np.polyfit(np.log(SLOTS), np.log(sizes), 1)[0]

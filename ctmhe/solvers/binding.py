@@ -138,10 +138,12 @@ class Functions:
         structures = []
         for name, function in zip(STAGE_FUNCTIONS, functions, strict=False):
             exported = getattr(core, name, None)
+            # second derivatives are asked for slot by slot: a tape, slow to read, would be no faster than CasADi itself
+            alone = name == "ctmhe_stage_curvature" and _casadi_eval() is not None
             if exported is not None:
                 structures.append(self._compiled(core, name))
             else:
-                structures.append(self._taped(function) or self._virtual(stage, function))
+                structures.append((None if alone else self._taped(function)) or self._virtual(stage, function))
         sizes = (stage.nx, stage.nw, stage.np, stage.nu, stage.ny, stage.q, stage.steps)
         self.structure = Stage(*sizes, stage.step_length, bool(stage.symbolic), *structures)
 
