@@ -28,11 +28,11 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from importlib.util import find_spec
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from tqdm import tqdm
@@ -59,25 +59,10 @@ def row(part: str, problem: str, what: str, value: float, unit: str, target: flo
     return {"part": part, "problem": problem, "what": what, "value": float(value), "unit": unit, "target": target}
 
 
-@contextmanager
-def surroundings(**variables: str) -> Iterator[None]:
-    """Set environment variables, for processes to inherit."""
-    kept = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name, value in kept.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
-
-
 def apart(function: Callable[..., Any], *arguments: Any) -> Any:
     """Return what a function returns in a fresh process that has made its imports."""
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         return pool.submit(function, *arguments).result()
-
-
-# ---- startup -------------------------------------------------------------------------------------------------------
 
 
 def begin(name: str, compile: str) -> tuple[float, float, float]:
@@ -107,13 +92,11 @@ def compilers() -> dict[str, tuple[str, float]]:
 def startup(problems: Sequence[str], compile: str) -> Iterator[Row]:
     """Yield the seconds to the first estimate."""
     for name in problems:
-        with tempfile.TemporaryDirectory() as folder, surroundings(CTMHE_CACHE=folder):
+        with tempfile.TemporaryDirectory() as folder, patch.dict(os.environ, CTMHE_CACHE=folder):
             yield from first(name, "off", "virtual machine")
         for kind, (command, target) in compilers().items() if compile == "auto" else ():
-            with (
-                tempfile.TemporaryDirectory() as folder,
-                surroundings(CTMHE_CACHE=f"{folder}/ctmhe", CC=command, ZIG_GLOBAL_CACHE_DIR=f"{folder}/zig"),
-            ):
+            with tempfile.TemporaryDirectory() as folder, patch.dict(os.environ, CC=command):
+                os.environ |= {"CTMHE_CACHE": f"{folder}/ctmhe", "ZIG_GLOBAL_CACHE_DIR": f"{folder}/zig"}
                 seconds, _, busy = apart(begin, name, "auto")
                 yield row("startup", name, f"{kind}: construction that compiles", seconds, "s", target)
                 yield row("startup", name, f"{kind}: of the processor, in compilers", busy, "s")
@@ -126,9 +109,6 @@ def first(name: str, compile: str, kind: str) -> Iterator[Row]:
     yield row("startup", name, f"{kind}: construction", np.median(seconds[:, 0]), "s")
     yield row("startup", name, f"{kind}: first update", np.median(seconds[:, 1]), "s")
     yield row("startup", name, f"{kind}: both", np.median(seconds.sum(axis=1)), "s", 0.2)
-
-
-# ---- jump ----------------------------------------------------------------------------------------------------------
 
 
 def jump(problems: Sequence[str], compile: str, updates: int) -> Iterator[Row]:
@@ -159,9 +139,6 @@ def jump(problems: Sequence[str], compile: str, updates: int) -> Iterator[Row]:
         yield row("jump", name, "ratio", many / one, "", 2.0)
         yield row("jump", name, "iterations, by one interval", iterations[:, 0].mean(), "")
         yield row("jump", name, f"iterations, by {intervals} intervals", iterations[:, 1].mean(), "")
-
-
-# ---- endurance -----------------------------------------------------------------------------------------------------
 
 
 def reactor(compile: str) -> MHE:
@@ -238,7 +215,8 @@ def endure(updates: int, compile: str) -> list[Row]:
     compiled = readings[-1][3] - readings[0][3]
     at, size, objects, _ = np.array(readings[1:], float).T
     slope = np.polyfit(at, size, 1)[0] if len(at) > 1 else 0.0
-    tenths = [rate(seconds, 0, updates // 10), rate(seconds, updates - updates // 10, updates)]
+    edges = np.array([0.0, 0.1, 0.9, 1.0]) * updates
+    tenths = 1e7 / updates * np.diff(np.interp(edges, *np.array([(0, 0.0), *seconds]).T))
     kind = "reactor"
     shown = [*range(0, len(at) - 1, POINTS // 5), -1]
     return [
@@ -251,24 +229,15 @@ def endure(updates: int, compile: str) -> list[Row]:
         row("endurance", kind, "libraries compiled during the run", compiled, "", 0.0),
         row("endurance", kind, "IPOPT programs built", mhe._reference.built, "", 0.0),
         row("endurance", kind, "the core's memory, allocated anew", moved, "", 0.0),
-        row("endurance", kind, "time in the first tenth", 1e6 * tenths[0], "us an update"),
-        row("endurance", kind, "time in the last tenth", 1e6 * tenths[1], "us an update"),
+        row("endurance", kind, "time in the first tenth", tenths[0], "us an update"),
+        row("endurance", kind, "time in the last tenth", tenths[2], "us an update"),
     ]
-
-
-def rate(seconds: Sequence[tuple[int, float]], start: int, end: int) -> float:
-    """Return the seconds of an update between two numbers of updates."""
-    k, total = np.array([(0, 0.0), *seconds]).T
-    return float(np.diff(np.interp([start, end], k, total))[0] / max(end - start, 1))
 
 
 def endurance(updates: int, compile: str) -> Iterator[Row]:
     """Yield the rows of the long run, which has a process and a cache of its own."""
-    with tempfile.TemporaryDirectory() as folder, surroundings(CTMHE_CACHE=folder):
+    with tempfile.TemporaryDirectory() as folder, patch.dict(os.environ, CTMHE_CACHE=folder):
         yield from apart(endure, updates, compile)
-
-
-# ---- memory --------------------------------------------------------------------------------------------------------
 
 
 def memory(problems: Sequence[str]) -> Iterator[Row]:
@@ -287,9 +256,6 @@ def memory(problems: Sequence[str]) -> Iterator[Row]:
             yield row("memory", name, f"scratch a slot, N = {n}", value / n, "bytes")
         slope = np.polyfit(np.log(SLOTS), np.log(sizes), 1)[0]
         yield row("memory", name, "exponent in N", slope, "", 1.15)
-
-
-# ---- command line --------------------------------------------------------------------------------------------------
 
 
 def line(result: Row) -> str:
