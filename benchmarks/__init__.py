@@ -2,6 +2,7 @@
 
 python -m benchmarks.solvers --json results.json    every tool on every problem
 python -m benchmarks.profile_update                 where one update of ctmhe spends its time
+python -m benchmarks.limits --json limits.json      first updates, jumps, a million updates, the core's memory
 python -m benchmarks.report results.json            docs/benchmarks.md and its plots
 """
 

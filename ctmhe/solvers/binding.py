@@ -142,9 +142,10 @@ class Functions:
                 structures.append(Function(batch=ctypes.cast(batch, ctypes.c_void_p).value))
             elif getattr(core, name, None) is not None:
                 structures.append(self._compiled(core, name))
-            else:  # second derivatives are rarely asked for, and long to read
-                taped = None if name == STAGE_FUNCTIONS[2] else self._taped(function)
-                structures.append(taped or self._virtual(stage, function))
+            else:
+                # second derivatives are asked for slot by slot: a tape, slow to read, would be no faster than CasADi
+                alone = name == "ctmhe_stage_curvature" and _casadi_eval() is not None
+                structures.append((None if alone else self._taped(function)) or self._virtual(stage, function))
         sizes = (stage.nx, stage.nw, stage.np, stage.nu, stage.ny, stage.q, stage.steps)
         self.structure = Stage(*sizes, stage.step_length, bool(stage.symbolic), *structures)
 

@@ -150,7 +150,7 @@ def test_a_library_for_one_model_does_the_same_and_refuses_another(rng, library,
     """Sizes as constants change nothing; a model of other sizes is refused."""
     mhe, window, guess = case("Chua, parameter and its bound", rng)
     stage = mhe.stage
-    sizes = dict(NX=stage.nx, NW=stage.nw, NP=stage.np, NY=stage.ny, NQ=stage.q)
+    sizes = dict(NX=stage.nx, NW=stage.nw, NP=stage.np, NY=stage.ny, NQ=stage.q, TAPE=1)
     special = build(tmp_path / "special.so", *(f"-DCTMHE_{key}={value}" for key, value in sizes.items()))
     assert CompiledGaussNewton(stage, special).solve(window, guess).cost == pytest.approx(
         CompiledGaussNewton(stage, library).solve(window, guess).cost, rel=1e-12

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ctmhe.models.library import quadrotor
 from ctmhe.solvers import tape as module
 from ctmhe.solvers.binding import Function
-from ctmhe.solvers.tape import BATCH, OPERATIONS, tape_of
+from ctmhe.solvers.tape import BATCH, OPERATIONS, Tape, tape_of, written_in_c
 from ctmhe.transcription import RK4
 from ctmhe.transcription.stage import StageFunction
 from tests.solvers.test_core import SOURCE, build
@@ -40,17 +40,27 @@ class _Call(ctypes.Structure):
                 ("h", ctypes.c_double)]  # fmt: skip
 
 
-@pytest.fixture(scope="module", params=[(), ("-DCTMHE_BASELINE",)], ids=["any", "baseline"])
+@pytest.fixture(scope="module", params=["any", "baseline", "compiled"])
 def runner(request, tmp_path_factory):
-    """Run a function's tape for some slots: rows of results, one array a result."""
-    folder = tmp_path_factory.mktemp("tape")
-    harness = folder / "harness.c"
-    harness.write_text(
-        f'#include "{SOURCE}"\n'
-        "int run(const ctmhe_function *f, const call *calls, int lanes) { return run_tape(f, calls, lanes); }\n"
-    )
-    library = ctypes.CDLL(str(build(folder / "tape.so", f"-I{SOURCE.parent}", "-ffp-contract=off", *request.param,
-                                    source=harness)))  # fmt: skip
+    """Run a function's tape, as it is or written in C, for some slots: rows of results, one array a result."""
+    folder, exact = tmp_path_factory.mktemp("tape"), (f"-I{SOURCE.parent}", "-ffp-contract=off", "-fno-math-errno")
+    known = {}
+
+    def library_of(function: ca.Function, tape: Tape) -> ctypes.CDLL:
+        compiled = request.param == "compiled"
+        key = function.name() if compiled else ""
+        if key not in known:
+            harness = folder / f"harness_{key}.c"
+            harness.write_text(
+                '#include "tape.h"\n'
+                + (written_in_c(tape, "written") if compiled else "")
+                + "int run(const ctmhe_function *f, const call *calls, int lanes) "
+                + ("{ (void)f; return written(calls, lanes); }" if compiled else "{ return run_tape(f, calls, lanes); }")
+            )
+            flags = ("-DCTMHE_BASELINE",) if request.param == "baseline" else ()
+            unused = ("-Wno-unused-function",)
+            known[key] = ctypes.CDLL(str(build(folder / f"{key}.so", *exact, *flags, *unused, source=harness)))
+        return known[key]
 
     def run(function: ca.Function, arguments: list[np.ndarray]) -> list[np.ndarray]:
         tape, lanes = tape_of(function), len(arguments[0])
@@ -59,6 +69,7 @@ def runner(request, tmp_path_factory):
         structure = Function(
             tape=tape.instructions.ctypes.data, constants=tape.constants.ctypes.data,
             registers=-(-registers.ctypes.data // 64) * 64, tape_length=len(tape.instructions),
+            sizes=(ctypes.c_int * 3)(*tape.sparse),
         )  # fmt: skip
         rows = [np.ascontiguousarray(array, dtype=float) for array in arguments]
         results = [np.full((lanes, function.nnz_out(i)), np.nan) for i in range(function.n_out())]
@@ -68,7 +79,7 @@ def runner(request, tmp_path_factory):
                 calls[lane].arg[i] = array[lane].ctypes.data
             for i, array in enumerate(results):
                 calls[lane].res[i] = array[lane].ctypes.data
-        assert library.run(ctypes.byref(structure), calls, lanes) == 0
+        assert library_of(function, tape).run(ctypes.byref(structure), calls, lanes) == 0
         return results
 
     return run

@@ -50,8 +50,8 @@ typedef struct { double lane[BATCH]; } lanes_of_doubles;
 #endif
 
 /* The arguments of all lanes, one behind the other; idle lanes repeat the first. */
-INLINE void take_arguments(lanes_of_doubles *in, const call *calls, int lanes, const int *sizes) {
-  for (int j = 0; j < 7; j++)
+INLINE void take_arguments(lanes_of_doubles *in, const call *calls, int lanes, int count, const int *sizes) {
+  for (int j = 0; j < count; j++)
     for (int i = 0; i < sizes[j]; i++, in++)
       for (int l = 0; l < BATCH; l++) LANE(*in, l) = calls[l < lanes ? l : 0].arg[j][i];
 }
