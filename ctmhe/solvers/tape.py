@@ -98,7 +98,7 @@ def written_in_c(tape: Tape, name: str) -> str:
         f"static const int taken[] = {{{_listed(tape.arguments)}}}, sizes[] = {{{_listed(tape.results)}}};",
         f"static const int counts[] = {{{_listed(map(len, tape.written))}}}, at[] = {{{_listed(e for _, e in at)}}};",
         f"lanes_of_doubles in[{first[-1] + 1}], out[{len(at) + 1}];",
-        f"lanes_of_doubles {', '.join(f'r{i}' for i in range(tape.registers))};",
+        f"lanes_of_doubles {', '.join(f'r{i} = {{0}}' for i in range(tape.registers))};",
         f"take_arguments(in, calls, lanes, {len(tape.arguments)}, taken);",
     ]
     for code, target, left, right in tape.instructions.tolist():

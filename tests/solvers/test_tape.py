@@ -55,7 +55,8 @@ def runner(request, tmp_path_factory):
                 '#include "tape.h"\n'
                 + (written_in_c(tape, "written") if compiled else "")
                 + "int run(const ctmhe_function *f, const call *calls, int lanes) "
-                + ("{ (void)f; return written(calls, lanes); }" if compiled else "{ return run_tape(f, calls, lanes); }")
+                + ("{ (void)f; return written(" if compiled else "{ return run_tape(f, ")
+                + "calls, lanes); }"
             )
             flags = ("-DCTMHE_BASELINE",) if request.param == "baseline" else ()
             unused = ("-Wno-unused-function",)
