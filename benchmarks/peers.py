@@ -58,7 +58,7 @@ class Ctmhe:
         self.problem, self.mhe = problem, build(problem, **options)
         if compiled and not getattr(self.mhe, "compiled", True):
             raise Unavailable("no C compiler was found")
-        starter = build(problem, **{**options, "max_iterations": 50}) if mode == ONE else self.mhe
+        starter = build(problem, **{**options, "max_iterations": 100}) if mode == ONE else self.mhe
         self.start = grow(starter, problem)
         self.restart()
         if mode == ONE:

@@ -87,7 +87,8 @@ class MHE:
         Weights and discount. A prior weight over states only holds the parameters at their given values; one over
         states and parameters estimates them.
     bounds : Bounds, optional
-        Imposed on x at every node, w, p, and y and the output residual at slot ends.
+        Imposed on x at every node (cell edges, samples, input switches), on w and p, and on y and the output residual
+        at the nodes.
     hold : {"zero", "linear", "point"} or mapping output -> one of these, optional
         `zero` and `linear` rebuild the whole signal from the samples, weighted by R; `point` counts each sample at
         its own time, weighted by R_point. Default `zero`.
@@ -111,7 +112,7 @@ class MHE:
         by about the square root of this, in standard deviations.
     max_iterations : int, optional
         Real time: stop after so many iterations and take the iterate for the estimate, `Outcome.ITERATION_LIMIT`; 1 is
-        the real-time iteration. When left out, iterate until converged, and where 50 are not enough ask others.
+        the real-time iteration. When left out, iterate until converged, and where 100 are not enough ask others.
     deadline : float, optional
         Real time: seconds by `clock` after which a solve stops between two iterations, `Outcome.DEADLINE`.
     verify : bool
@@ -201,7 +202,7 @@ class MHE:
             input_hold=input_hold,
             filtering=filtering,
         )
-        limits: dict[str, Any] = {"max_iterations": max_iterations or 50, "deadline": deadline, "clock": clock}
+        limits: dict[str, Any] = {"max_iterations": max_iterations or 100, "deadline": deadline, "clock": clock}
         if tolerance is not None:
             limits["tolerance"] = positive("tolerance", tolerance)
         self._gauss_newton = GaussNewton(self.stage, **limits)

@@ -71,7 +71,7 @@ class CompiledGaussNewton:
         stage: StageFunction,
         library: Path,
         *,
-        max_iterations: int = 50,
+        max_iterations: int = 100,
         deadline: float | None = None,
         clock: Callable[[], float] = time.perf_counter,
         tolerance: float = 1e-9,

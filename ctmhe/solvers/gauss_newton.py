@@ -67,7 +67,7 @@ class GaussNewton:
         self,
         stage: StageFunction,
         *,
-        max_iterations: int = 50,
+        max_iterations: int = 100,
         deadline: float | None = None,
         clock: Callable[[], float] = time.perf_counter,
         tolerance: float = 1e-11,

@@ -20,7 +20,7 @@ UNSTABLE = (322, 552, 643, 655, 819, 975)  # starts of seed 0 from which IPOPT g
 def solver_of(name: str, kind: str):
     """A solver for a model of the benchmark; the core calls CasADi's virtual machine."""
     stage = SETTINGS[name]().mhe.stage
-    return compiled_solver(stage, specialise=False) if kind == "core" else GaussNewton(stage, max_iterations=100)
+    return compiled_solver(stage, specialise=False) if kind == "core" else GaussNewton(stage)
 
 
 @pytest.mark.parametrize("name", ["batch_reactor", "chua", "van_der_pol", "cascaded_tanks"])
