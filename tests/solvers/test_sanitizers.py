@@ -14,7 +14,10 @@ ROOT = Path(__file__).parents[2]
 COMPILER = next((p for p in (os.environ.get("CC"), "gcc", "clang", "cc") if p and shutil.which(p)), None)
 SANITIZE = "-O0 -g -fsanitize=address,undefined -fno-sanitize-recover=all -fno-omit-frame-pointer"
 # ctmhe_solve, ctmhe_update, ctmhe_covariance; sizes from one variable a slot to 48; what makes a window degenerate
-TESTS = ("test_core.py", "test_covariance.py", "test_updates.py", "test_wide.py", "test_degenerate.py")
+TESTS = (
+    "test_core.py", "test_covariance.py", "test_updates.py", "test_wide.py", "test_degenerate.py", "test_slots.py",
+    "../estimators/test_real_time.py::test_a_prepared_quadrotor_is_the_quadrotor",
+)  # fmt: skip
 # without the core, or with more builds of it
 LEFT_OUT = "numpy or compiled or library_for_one_model or every_size_gives or any_window or CVODES or correlated"
 
