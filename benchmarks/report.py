@@ -1,4 +1,7 @@
-"""Write docs/benchmarks.md and its plots from a run's rows: `python -m benchmarks.report FILE.json [--docs DIR]`."""
+"""Write docs/benchmarks.md and its plots from a run's rows: `python -m benchmarks.report FILE.json [--docs DIR]`.
+
+Beside the file, `starts.json` and `limits.json` give the sections of these benchmarks.
+"""
 
 from __future__ import annotations
 
@@ -43,9 +46,10 @@ Look at the ratios: the milliseconds belong to a machine.
 
 The tools: `ipopt` is CasADi's IPOPT with the exact Hessian as it is usually set up; `ipopt-warm` starts with a barrier
 parameter of 1e-6 and the shifted multipliers; `fatrop` is CasADi's plugin; `sqp-hpipm` and `sqp-qrqp` are CasADi's
-sqpmethod with the Gauss-Newton Hessian, with the loosest tolerance (of powers of ten) that still gives the common cost;
-`do-mpc` is its MHE class. *Converged* means that a tool says so and that its cost agrees with the common one to 1e-6 in
-every window.
+sqpmethod with the Gauss-Newton Hessian; `do-mpc` is its MHE class. `ctmhe` is timed with the model compiled and, "not
+compiled", with the model's tape (for vdp, CasADi's CVODES) in the core that the package ships. Methods with a
+tolerance, ours included, get the loosest (of powers of ten) that still gives the common cost in the first windows.
+*Converged* means that a tool says so and that its cost agrees with the common one to 1e-6 in every window.
 """
 
 
@@ -53,7 +57,7 @@ def title(row: dict[str, Any]) -> str:
     """Return a tool's name with its kind of model functions."""
     if row["tool"] != "ctmhe":
         return row["tool"]
-    return "ctmhe, compiled" if row["compiled"] else "ctmhe, CasADi VM"
+    return "ctmhe, compiled" if row["compiled"] else "ctmhe, not compiled"
 
 
 def cell(row: dict[str, Any], base: float | None) -> str:
@@ -155,13 +159,69 @@ def scaling(rows: Rows, path: Path) -> bool:
     return True
 
 
-def page(rows: Rows, docs: Path) -> Path:
-    """Write the page and its plots below `docs`."""
+def ratios(rows: Rows) -> list[str]:
+    """Return how many times faster than two peers, compiled and not; converged tools only."""
+    lines = ["| problem | IPOPT warm | sqpmethod + qrqp | IPOPT warm, not compiled |", "|---|---|---|---|"]
+    for problem in (name for name in PROBLEMS if any(row["problem"] == name for row in rows)):
+        here = {
+            (row["tool"], row["compiled"]): row["median_ms"]
+            for row in rows
+            if row["problem"] == problem and row["mode"] == CONVERGED and row["converged"]
+        }
+        pairs = ((True, "ipopt-warm"), (True, "sqp-qrqp"), (False, "ipopt-warm"))
+        cells = [
+            f"{here[tool, False] / here['ctmhe', compiled]:.1f}"
+            if (tool, False) in here and ("ctmhe", compiled) in here
+            else "–"
+            for compiled, tool in pairs
+        ]
+        lines.append(f"| {problem} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def starts(rows: Rows) -> list[str]:
+    """Return the section on random starts."""
+    lines = [
+        "## Poor guesses", "",
+        "Random starts within the bounds of every library model (`python -m benchmarks.starts`): how often IPOPT and",
+        "Gauss-Newton end at the lowest cost that IPOPT finds at all. *Share*: of the starts from which IPOPT gets",
+        "there, those from which Gauss-Newton does. *False*: success where IPOPT still gains more than 1e-8.", "",
+        "| model | starts | IPOPT | Gauss-Newton | share | false | median iterations |",
+        "|---|---|---|---|---|---|---|",
+    ]  # fmt: skip
+    return (
+        lines
+        + [
+            f"| {row['model']} | {row['starts']} | {row['ipopt']:.1%} | {row['ours']:.1%} | {row['share']:.2%} | "
+            f"{row['false']} | {row['iterations']:.0f} |"
+            for row in rows
+        ]
+        + [""]
+    )
+
+
+def limits(rows: Rows) -> list[str]:
+    """Return the section on start-up, jumps, endurance and memory."""
+    lines = [
+        "## Start-up, jumps, endurance, memory", "",
+        "`python -m benchmarks.limits`, with what was asked for where something was.", "",
+        "| part | problem | what | value | at most |", "|---|---|---|---|---|",
+    ]  # fmt: skip
+    for row in rows:
+        most = "" if row["target"] is None else f"{row['target']:g}"
+        value = f"{row['value']:.3g}" if abs(row["value"]) < 1e5 else f"{row['value']:.0f}"
+        lines.append(f"| {row['part']} | {row['problem']} | {row['what']} | {value} {row['unit']} | {most} |")
+    return [*lines, ""]
+
+
+def page(rows: Rows, docs: Path, beside: Path) -> Path:
+    """Write the page and its plots below `docs`, with the rows of the other benchmarks that lie in a folder."""
     images = docs / "images"
     images.mkdir(parents=True, exist_ok=True)
     bars(rows, images / "benchmark_medians.png")
     machine = rows[0].get("machine", {})
     lines = [INTRODUCTION, "## Converged", "", *medians(rows, CONVERGED), "", "✗: not converged in every window.", ""]
+    lines += ["How many times faster than these:", "", *ratios(rows), ""]
     lines += ["![medians](images/benchmark_medians.png)", "", "## One iteration an update", ""]
     lines += ["What such an iteration costs is no longer the optimum's; where it stays within 1e-6 is luck.", ""]
     lines += [*medians(rows, ONE), ""]
@@ -178,6 +238,9 @@ def page(rows: Rows, docs: Path) -> Path:
             for fit in exponents(rows)
         ]
         lines += [""]
+    for name, section in (("starts", starts), ("limits", limits)):
+        if (beside / f"{name}.json").exists():
+            lines += section(json.loads((beside / f"{name}.json").read_text()))
     lines += [
         "## Spread, iterations, set-up",
         "",
@@ -199,7 +262,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("rows", type=Path, help="JSON written by benchmarks.solvers")
     parser.add_argument("--docs", type=Path, default=Path(__file__).resolve().parents[1] / "docs")
     options = parser.parse_args(arguments)
-    print(page(json.loads(options.rows.read_text()), options.docs))
+    print(page(json.loads(options.rows.read_text()), options.docs, options.rows.parent))
 
 
 if __name__ == "__main__":
