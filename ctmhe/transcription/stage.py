@@ -91,7 +91,7 @@ class StageFunction:
             duals = [kind.sym("lambda_x", self.nx), kind.sym("lambda_y", y.numel())]
             lagrangian = ca.dot(duals[0], x_next) + ca.dot(duals[1], y)
             hessian, _ = ca.hessian(lagrangian, ca.vertcat(*symbols[2:5]))
-            functions.append(ca.Function("stage_curvature", symbols + duals, shared([ca.densify(hessian)])))
+            functions.append(ca.Function("stage_curvature", symbols + duals, [ca.densify(hessian)]))
         self.mapped = [{size: function.map(size) for size in CHUNKS} for function in functions]
         self._local = local()
 
