@@ -150,7 +150,7 @@ class CompiledGaussNewton:
 
 
 def compiled_solver(
-    stage: StageFunction, *, specialise: bool, p_estimated: bool = False, **limits: Any
+    stage: StageFunction, *, specialise: bool, p_estimated: bool, **limits: Any
 ) -> CompiledGaussNewton | None:
     """Return the solver in the core, if wished compiled for `stage`; None, with the reason logged, without any."""
     library = (specialised_core(stage, p_estimated) if specialise else None) or shipped_core()

@@ -19,8 +19,9 @@ UNSTABLE = (322, 552, 643, 655, 819, 975)  # starts of seed 0 from which IPOPT g
 
 def solver_of(name: str, kind: str):
     """A solver for a model of the benchmark; the core calls CasADi's virtual machine."""
-    stage = SETTINGS[name]().mhe.stage
-    return compiled_solver(stage, specialise=False) if kind == "core" else GaussNewton(stage)
+    mhe = SETTINGS[name]().mhe
+    stage, estimated = mhe.stage, mhe.assembly.p_estimated
+    return compiled_solver(stage, specialise=False, p_estimated=estimated) if kind == "core" else GaussNewton(stage)
 
 
 @pytest.mark.parametrize("name", ["batch_reactor", "chua", "van_der_pol", "cascaded_tanks"])

@@ -422,6 +422,7 @@ static int solve_program(core *k, const model *m, int *factorizations) {
   memcpy(k->active, k->kept, k->nf);
   copy(k->d, k->s_low, k->nf);
   copy(k->z, k->s_high, k->nf);
+  k->calm = 0; /* the last pass may have held nothing; this set may */
   adjoint(k, m);
   return OK;
 }
