@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from ctmhe.estimators import MHE
 from ctmhe.estimators.guesses import shifted_guess
 from ctmhe.models import ContinuousModel
+from ctmhe.solvers import tape
 from ctmhe.solvers.binding import Functions, load
 from ctmhe.solvers.compiled import CompiledGaussNewton
 from ctmhe.solvers.gauss_newton import GaussNewton
@@ -21,6 +23,7 @@ from ctmhe.transcription import RK4
 from ctmhe.transcription.stage import StageFunction
 from ctmhe.types import Bounds, DiscountedCost, Input, Measurement
 from tests.solvers.test_core import SOURCE, build
+from tests.solvers.test_wide import window_of
 
 STEP = 0.1
 
@@ -152,3 +155,16 @@ def test_all_solvers_find_the_same_in_slots_of_several_steps(hold, boxed, librar
         np.testing.assert_allclose(solution.point.x, found[2].point.x, atol=1e-4)
     if boxed:
         assert np.abs(found[0].point.x_active).sum() + np.abs(found[0].point.y_active).sum() > 0
+
+
+@pytest.mark.parametrize("interval", [None, 5 * STEP])
+def test_values_on_a_tape_and_jacobians_that_are_too_long_for_one(interval, library, rng, monkeypatch):
+    """Eight slots at once without derivatives, one by one with them: the same solution."""
+    stage = StageFunction(pendulum(), RK4(STEP), signal=False, interval=interval)
+    window, guess = window_of(stage, 12, rng, boxed=False, shared=False)
+    window = replace(window, u0=rng.normal(size=(12, 1)), u1=rng.normal(size=(12, 1)))
+    expected = CompiledGaussNewton(stage, library).solve(window, guess)
+    monkeypatch.setattr(tape, "LARGE", (stage.value.n_instructions() + stage.derivative.n_instructions()) // 2)
+    assert tape.tape_of(stage.value) is not None and tape.tape_of(stage.derivative) is None
+    mixed = CompiledGaussNewton(stage, library).solve(window, guess)
+    assert expected.success and mixed.cost == pytest.approx(expected.cost, rel=1e-12)

@@ -211,7 +211,7 @@ static size_t lay_out(core *k, char *scratch, const ctmhe_stage *s, int slots, i
   k->barrier_spring = DOUBLES(&memory, k->nf);
   k->barrier_force = DOUBLES(&memory, 3 * k->nf); /* and the centring terms */
   k->lambda = DOUBLES(&memory, N * nx);
-  const size_t lanes = (size_t)lanes_of(&s->jacobian);
+  const size_t lanes = (size_t)(lanes_of(&s->value) > 1 ? lanes_of(&s->value) : lanes_of(&s->jacobian));
   k->lane = DOUBLES(&memory, lanes * (nx + qy + (nx + qy) * n0));
   k->steps = DOUBLES(&memory, s->steps > 1 ? lanes * step_work_size(s, 1) : 0);
   k->second = DOUBLES(&memory, curvature_work_size(s));

@@ -23,17 +23,6 @@ static int evaluate(const core *k, const ctmhe_function *f, const model *m, int 
   return evaluate_slots(k->s, f, calls, lanes, k->steps);
 }
 
-/* The same for one slot of one step by a compiled function, without detours. */
-INLINE int evaluate_directly(const core *k, const ctmhe_function *f, const model *m, int slot, int derivatives) {
-  const slot_call c = slot_at(k, m, slot, 0, derivatives);
-  const double *given[CTMHE_MAX_ARGUMENTS];
-  double *taken[CTMHE_MAX_ARGUMENTS];
-  given[0] = k->win->t + slot, given[1] = k->win->h + slot, given[2] = c.x, given[3] = c.w, given[4] = c.p;
-  given[5] = c.u0, given[6] = c.u1;
-  taken[0] = c.x_next, taken[1] = c.y, taken[2] = c.J;
-  return f->function(given, taken, f->iw, f->w, 0);
-}
-
 /* The rows of L_y J_y of one evaluation point, and the residual; returns the number of rows. */
 INLINE int weighted_rows(const core *k, int slot, int point, const double *y, const double *jacobian, double *rows,
                          double *residual, int nx, int nw, int np, int all) {
@@ -87,13 +76,10 @@ INLINE int linearize_sized(core *k, model *m, int with_jacobian, int nx, int nw,
     total += r * r;
   }
   const int lanes = lanes_of(f), qy = q * ny, lane_size = nx + qy + (nx + qy) * (nx + nw + all);
-  const int direct = f->function && s->steps == 1;
   for (int slot = 0; slot < N; slot++) {
     const int lane = slot % lanes;
     double *parts = m->parts + 4 * slot, cost = 0.0, infeasibility = 0.0, defect = 0.0, excess = 0.0, finite = 0.0;
-    if (direct) {
-      if ((!stale || stale[slot]) && evaluate_directly(k, f, m, slot, with_jacobian)) return 1;
-    } else if (lane == 0) {
+    if (lane == 0) {
       const int count = N - slot < lanes ? N - slot : lanes;
       if ((!stale || memchr(stale + slot, 1, (size_t)count)) && evaluate(k, f, m, slot, count, with_jacobian)) return 1;
     }

@@ -40,7 +40,7 @@ static int steps_of(const ctmhe_stage *s, double h) {
   return needed < 1.0 ? 1 : needed > s->steps ? s->steps : (int)needed;
 }
 
-/* Work of one lane: t, h, u0 and u1 of a step, its results, and the state that it starts from. */
+/* Work of one lane: u0 and u1 of a step, its results, and the state that it starts from. */
 typedef struct {
   double *u0, *u1, *x_next, *y, *J, *x;
 } workspace;
@@ -144,7 +144,6 @@ static int evaluate_slots(const ctmhe_stage *s, const ctmhe_function *f, const s
       live[count] = l;
       set_step(s, slots + l, &k, calls + count++, i, steps[l]);
     }
-    for (int l = 0; l < count; l++) calls[l].arg[0] = &calls[l].t, calls[l].arg[1] = &calls[l].h;
     if (call_step(s, f, calls, count, results)) return 1;
     for (int l = 0; l < count; l++) {
       const workspace k = work_of(s, memory + (size_t)live[l] * size);
