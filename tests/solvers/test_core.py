@@ -72,6 +72,17 @@ def window_of(mhe: MHE, state, end: float) -> tuple[Window, Guess]:
     return window, shifted_guess(mhe.stage, window)
 
 
+def irregular_window(mhe: MHE, rng) -> tuple[Window, Guess]:
+    """A window of the reactor whose samples split cells."""
+    state, t = mhe.init(x=[2.0, 1.0]), 0.0
+    while t < 0.93:
+        state = mhe.observe(state, Measurement(t, [3.0 + 0.1 * rng.normal()]))
+        t += rng.exponential(0.05) + 1e-3
+    window, guess = window_of(mhe, state, 0.95)
+    assert window.mesh.shared.any()
+    return window, guess
+
+
 def case(name: str, rng) -> tuple[MHE, Window, Guess]:
     """One of the agreement cases as a window."""
     model, options, guess, truth, p_guess, p_true, u, noise = cases()[name]
@@ -124,12 +135,7 @@ def test_irregular_samples_share_disturbances(rng, library, kind):
     model = batch_reactor()
     for bounds in (Bounds(), Bounds(w=(-0.05, 0.05)), Bounds(w=(-0.3, 0.3), x=(0.1, 2.2), residual=(-0.4, 0.4))):
         mhe = MHE(model, horizon=1.0, interval=0.1, integrator=RK4(0.1), cost=REACTOR_COST, bounds=bounds, hold=kind)
-        state, t = mhe.init(x=[2.0, 1.0]), 0.0
-        while t < 0.93:
-            state = mhe.observe(state, Measurement(t, [3.0 + 0.1 * rng.normal()]))
-            t += rng.exponential(0.05) + 1e-3
-        window, guess = window_of(mhe, state, 0.95)
-        assert window.mesh.shared.any()
+        window, guess = irregular_window(mhe, rng)
         agree(mhe.stage, library, window, guess)
 
 

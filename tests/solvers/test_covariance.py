@@ -15,10 +15,9 @@ from ctmhe.solvers.compiled import CompiledGaussNewton
 from ctmhe.solvers.gauss_newton import GaussNewton
 from ctmhe.transcription import RK4
 from ctmhe.transcription.stage import StageFunction
-from ctmhe.types import Measurement
 from tests.conftest import REACTOR_COST
 from tests.solvers.test_agreement import cases
-from tests.solvers.test_core import STAGE, build, case, linear_window, still_guess, window_of
+from tests.solvers.test_core import STAGE, build, case, irregular_window, linear_window, still_guess
 from tests.solvers.test_wide import SIZES, chain
 from tests.solvers.test_wide import window_of as wide_window
 
@@ -55,12 +54,7 @@ def test_at_a_solution_both_solvers_agree(name, rng, library):
 def test_irregular_samples_share_disturbances(rng, library, kind):
     """Slots inside a cell have one w."""
     mhe = MHE(batch_reactor(), horizon=1.0, interval=0.1, integrator=RK4(0.1), cost=REACTOR_COST, hold=kind)
-    state, t = mhe.init(x=[2.0, 1.0]), 0.0
-    while t < 0.93:
-        state = mhe.observe(state, Measurement(t, [3.0 + 0.1 * rng.normal()]))
-        t += rng.exponential(0.05) + 1e-3
-    window, guess = window_of(mhe, state, 0.95)
-    assert window.mesh.shared.any()
+    window, guess = irregular_window(mhe, rng)
     agree(mhe.stage, library, window, guess)
 
 
