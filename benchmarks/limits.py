@@ -3,7 +3,7 @@
     python -m benchmarks.limits [--json FILE] [--updates 1000000] [--problems ...] [startup jump endurance memory]
 
     startup     in fresh processes with an empty cache: seconds from the construction of `MHE`, imports done, to the
-                end of the first estimate, in CasADi's virtual machine; seconds of compiling; and the first again, with
+                end of the first estimate, with the model not compiled; seconds of compiling; and the first again, with
                 what was compiled. Each the median of `PROCESSES`, compiling once
     jump        one window reached in one jump of many intervals, as after an event, and by moving on by one interval:
                 the estimates' median times
@@ -93,7 +93,7 @@ def startup(problems: Sequence[str], compile: str) -> Iterator[Row]:
     """Yield the seconds to the first estimate."""
     for name in problems:
         with tempfile.TemporaryDirectory() as folder, patch.dict(os.environ, CTMHE_CACHE=folder):
-            yield from first(name, "off", "virtual machine")
+            yield from first(name, "off", "not compiled")
         for kind, (command, target) in compilers().items() if compile == "auto" else ():
             with tempfile.TemporaryDirectory() as folder, patch.dict(os.environ, CC=command):
                 os.environ |= {"CTMHE_CACHE": f"{folder}/ctmhe", "ZIG_GLOBAL_CACHE_DIR": f"{folder}/zig"}

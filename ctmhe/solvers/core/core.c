@@ -359,7 +359,7 @@ static int take_up(core *k, const ctmhe_stage *stage, const ctmhe_window *window
   }
   for (int slot = 0; slot < N; slot++)
     for (int i = 0; i < nw; i++) {
-      const int at = slot * nw + i, from = slot && window->shared[slot - 1] ? at - nw : at; /* one w for all slots of a cell */
+      const int at = slot * nw + i, from = slot && window->shared[slot - 1] ? at - nw : at; /* one w a cell */
       const double value = from == at ? clip(guess->w[at], window->w_lower[at], window->w_upper[at]) : w[from];
       if (prepared && value != w[at]) stale[slot] = 1;
       w[at] = value;

@@ -216,8 +216,10 @@ static int backward(core *k, const model *m, int from, int right_hand_side) {
   if (right_hand_side) return ESTIMATED(k) ? backward_sized(k, m, from, 1, 0, nx, nw, np)
                                            : backward_sized(k, m, from, 1, 0, nx, nw, 0);
   int status;
-  if (k->calm) status = ESTIMATED(k) ? backward_sized(k, m, from, 0, 1, nx, nw, np) : backward_sized(k, m, from, 0, 1, nx, nw, 0);
-  else status = ESTIMATED(k) ? backward_sized(k, m, from, 0, 0, nx, nw, np) : backward_sized(k, m, from, 0, 0, nx, nw, 0);
+  if (k->calm)
+    status = ESTIMATED(k) ? backward_sized(k, m, from, 0, 1, nx, nw, np) : backward_sized(k, m, from, 0, 1, nx, nw, 0);
+  else
+    status = ESTIMATED(k) ? backward_sized(k, m, from, 0, 0, nx, nw, np) : backward_sized(k, m, from, 0, 0, nx, nw, 0);
   k->rebuilt = k->N;
   return status;
 }
@@ -352,7 +354,8 @@ INLINE void adjoint_sized(core *k, const model *m, int nx, int nw, int np) {
         rw[i] = 0.0;
       }
       /* what rounding left of w's gradient acts on x as in the backward sweep: an unstable model would let it grow */
-      if (slot) forward_eliminate(r, k->U + (size_t)slot * (size_t)(n * n), k->D + (size_t)(slot * n), nw, n, k->plain && !WIDE(n));
+      const double *U = k->U + (size_t)slot * (size_t)(n * n), *D = k->D + (size_t)(slot * n);
+      if (slot) forward_eliminate(r, U, D, nw, n, k->plain && !WIDE(n));
     }
     for (int i = 0; i < np; i++) rp[i] += r[nw + nx + i];
     if (slot == 0) {
