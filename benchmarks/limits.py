@@ -40,8 +40,8 @@ from tqdm import tqdm
 from benchmarks.problems import PROBLEMS
 from benchmarks.reference import build, grow, observe
 from ctmhe import MHE, RK4, DiscountedCost, Measurement, Outcome
+from ctmhe.compilers import cache_directory
 from ctmhe.models.library import batch_reactor
-from ctmhe.solvers.compilers import cache_directory
 from ctmhe.types import Array
 
 Row = dict[str, Any]

@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.problems import PROBLEMS, SCALING, Problem
 from benchmarks.reference import build, grow
-from ctmhe.solvers.compilers import Source, build_library
+from ctmhe.compilers import Source, build_library
 from ctmhe.types import Input, Measurement, Status
 
 REPEATS = 15

@@ -35,6 +35,38 @@ class FmuError(CtmheError, RuntimeError):
     """An FMU cannot be read, loaded, evaluated or used in the role that it was given."""
 
 
+class FmuArchiveError(FmuError):
+    """The file is no readable, harmless archive, or its description no readable XML."""
+
+
+class FmuVersionError(FmuError):
+    """The FMI version is none of 2.0 and 3.x."""
+
+
+class FmuKindError(FmuError):
+    """The FMU does not offer the kind (model exchange, co-simulation) that the role needs."""
+
+
+class FmuBinaryError(FmuError):
+    """There is no binary for this platform, or it cannot be loaded, instantiated or initialized."""
+
+
+class FmuUnsupportedError(FmuError):
+    """The FMU needs what is not supported: arrays, structural parameters, no continuous states, no outputs."""
+
+
+class FmuEventError(FmuError):
+    """The FMU has events, and an estimator was not allowed to freeze them."""
+
+
+class FmuParameterError(FmuError):
+    """A parameter cannot be changed as the role needs it."""
+
+
+class FmuDerivativeError(FmuError):
+    """Values or derivatives are not what they should be: an estimator would go wrong without saying so."""
+
+
 class MissingExtra(CtmheError, ImportError):
     """An optional library is not installed; the message names the extra that brings it."""
 

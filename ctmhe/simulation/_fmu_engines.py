@@ -10,8 +10,8 @@ from typing import Protocol
 import numpy as np
 
 from ctmhe.errors import FmuError
-from ctmhe.models._fmi import Instance, SavedState
-from ctmhe.models._fmu_description import CO_SIMULATION, MODEL_EXCHANGE, Description, Variable
+from ctmhe.models.fmu.description import CO_SIMULATION, MODEL_EXCHANGE, Description, Variable
+from ctmhe.models.fmu.instance import Instance, SavedState
 from ctmhe.simulation import _fmu_integrators as integrators
 from ctmhe.types import Array
 

@@ -43,7 +43,8 @@ class Stage(ctypes.Structure):
 
     _fields_ = [
         *((name, _int) for name in ("nx", "nw", "np", "nu", "ny", "q", "steps")),
-        ("step_length", _double), ("symbolic", _int),
+        ("step_length", _double),
+        ("symbolic", _int),
         *((name, Function) for name in ("value", "jacobian", "curvature")),
     ]
 

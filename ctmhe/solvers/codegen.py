@@ -13,8 +13,8 @@ from typing import Any
 
 import casadi as ca
 
+from ctmhe.compilers import NATIVE, Source, build_library, extra_flags, find_compiler
 from ctmhe.errors import SolverError
-from ctmhe.solvers.compilers import NATIVE, Source, build_library, extra_flags, find_compiler
 from ctmhe.solvers.tape import Tape, tape_of, written_in_c
 from ctmhe.transcription.stage import StageFunction
 

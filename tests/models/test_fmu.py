@@ -19,11 +19,11 @@ import pytest
 pytest.importorskip("fmpy")
 
 from ctmhe.errors import FmuError, InputError, MissingExtra
-from ctmhe.models._archive import Unpacked
-from ctmhe.models._fmi import Instance, read_description
-from ctmhe.models._fmu_description import CO_SIMULATION, MODEL_EXCHANGE
 from ctmhe.models.continuous import ContinuousModel, Model
 from ctmhe.models.fmu import FmuModel
+from ctmhe.models.fmu.archive import Unpacked
+from ctmhe.models.fmu.description import CO_SIMULATION, MODEL_EXCHANGE
+from ctmhe.models.fmu.instance import Instance, read_description
 from fmus.build import build
 
 X = np.array([2.3, 0.7])

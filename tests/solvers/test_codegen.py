@@ -14,12 +14,13 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from ctmhe import compilers
+from ctmhe.compilers import Source, build_library, find_compiler
 from ctmhe.errors import SolverError
 from ctmhe.models import ContinuousModel
 from ctmhe.models.library import batch_reactor, van_der_pol
-from ctmhe.solvers import codegen, compilers
+from ctmhe.solvers import codegen
 from ctmhe.solvers.codegen import shipped_core, specialised_core
-from ctmhe.solvers.compilers import Source, build_library, find_compiler
 from ctmhe.transcription import CVODES, RK4
 from ctmhe.transcription.stage import StageFunction
 
@@ -131,7 +132,7 @@ def test_a_damaged_cache_is_built_again(damage, own_cache, runs):
 def test_processes_at_once_build_one_library(own_cache):
     """Processes that ask for the same library at the same time get the same valid file; nothing else is left behind."""
     code = (
-        "import sys, time; from ctmhe.solvers.compilers import Source, build_library\n"
+        "import sys, time; from ctmhe.compilers import Source, build_library\n"
         f"time.sleep(max(0.0, {time.time() + 1.5} - time.time()))\n"
         f"print(build_library('answer', {ANSWER!r}, defines={FORTY_TWO!r}))"
     )
@@ -224,7 +225,8 @@ def test_another_process_finds_the_compiled_stage_without_generating_code(reacto
     """The key is the same in every process, so that the second finds the library and neither generates nor compiles."""
     library = specialised_core(reactor, False)
     code = (
-        "from ctmhe.models.library import batch_reactor; from ctmhe.solvers import codegen, compilers\n"
+        "from ctmhe.models.library import batch_reactor; from ctmhe import compilers\n"
+        "from ctmhe.solvers import codegen\n"
         "from ctmhe.transcription import RK4; from ctmhe.transcription.stage import StageFunction\n"
         "codegen._generate = compilers._run = None\n"
         "print(codegen.specialised_core(StageFunction(batch_reactor(), RK4(0.05), signal=False), False))"

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ctmhe.compilers import find_compiler
 from ctmhe.errors import InputError
 from ctmhe.estimators import MHE
 from ctmhe.models.fmu import FmuModel
 from ctmhe.models.library import batch_reactor
-from ctmhe.solvers.compilers import find_compiler
 from ctmhe.transcription import CVODES, RK4
 from ctmhe.types import Bounds, DiscountedCost, Measurement
 from fmus.build import build

@@ -17,13 +17,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import ctmhe.solvers
+from ctmhe.compilers import extra_flags
 from ctmhe.errors import SolverError
 from ctmhe.estimators import MHE
 from ctmhe.estimators.guesses import shifted_guess
 from ctmhe.models import ContinuousModel
 from ctmhe.models.library import batch_reactor
 from ctmhe.solvers.compiled import CompiledGaussNewton
-from ctmhe.solvers.compilers import extra_flags
 from ctmhe.solvers.gauss_newton import GaussNewton
 from ctmhe.solvers.ipopt import Ipopt
 from ctmhe.transcription import RK4

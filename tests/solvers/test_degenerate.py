@@ -10,10 +10,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from ctmhe.compilers import find_compiler
 from ctmhe.errors import InputError
 from ctmhe.estimators import MHE
 from ctmhe.models import ContinuousModel
-from ctmhe.solvers.compilers import find_compiler
 from ctmhe.transcription import RK4
 from ctmhe.transcription.problem import rollout
 from ctmhe.types import Bounds, DiscountedCost, Measurement, Outcome

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctmhe.errors import FmuError, MissingExtra
-from ctmhe.models._fmu_description import CO_SIMULATION, MODEL_EXCHANGE, Description, Interface, Variable
+from ctmhe.models.fmu.description import CO_SIMULATION, MODEL_EXCHANGE, Description, Interface, Variable
 from ctmhe.types import Array
 
 log = logging.getLogger(__name__)

@@ -10,8 +10,8 @@ import casadi as ca
 import numpy as np
 
 from ctmhe.errors import FmuError
-from ctmhe.models._fmu_description import MODEL_EXCHANGE, Description, Variable
 from ctmhe.models.continuous import ARGUMENTS
+from ctmhe.models.fmu.description import MODEL_EXCHANGE, Description, Variable
 from ctmhe.types import Array
 
 # CasADi's own directional derivatives of FMUs are silently wrong inside mapped functions (a zero seed returns

@@ -11,9 +11,9 @@ import casadi as ca
 import numpy as np
 
 from ctmhe.errors import FmuError
-from ctmhe.models._fmi import Instance
-from ctmhe.models._fmu_description import MODEL_EXCHANGE, Description, Variable
-from ctmhe.models._fmu_functions import FmuFunctions
+from ctmhe.models.fmu.description import MODEL_EXCHANGE, Description, Variable
+from ctmhe.models.fmu.functions import FmuFunctions
+from ctmhe.models.fmu.instance import Instance
 from ctmhe.types import Array
 
 REACH = float(np.cbrt(np.finfo(float).eps))  # relative step of a central difference
