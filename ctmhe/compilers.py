@@ -20,7 +20,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from hashlib import sha256
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError, distribution, version
 from pathlib import Path
 
 from ctmhe.errors import SolverError
@@ -38,7 +38,7 @@ SHARED = () if WINDOWS else ("-fPIC", "-fno-semantic-interposition")
 # for what stays on this machine: wider vectors, with the same results as long as nothing is contracted
 NATIVE = ("-march=native", "-mtune=generic") if platform.machine().lower() in ("x86_64", "amd64") else ()
 # each library binds its names to itself: many of them live in one process
-LINK = ("-Wl,--export-all-symbols",) if WINDOWS else ("-lm",) if MACOS else ("-lm", "-Wl,-Bsymbolic")
+LINK = ("-Wl,--export-all-symbols",) if WINDOWS else ("-lm",) if MACOS else ("-lm", "-ldl", "-Wl,-Bsymbolic")
 
 
 @dataclass(frozen=True)
@@ -288,6 +288,60 @@ def _only_process(root: Path | None, key: str) -> Iterator[None]:
     finally:
         path.unlink(missing_ok=True)  # whoever opens it anew finds the entry
         os.close(handle)
+
+
+# ---- libraries that came with the package -------------------------------------------------------------------------
+
+
+def sources_digest(folder: Path) -> str:
+    """Return what identifies the C sources in a folder: a line `name sha256` each, as the package's build writes it."""
+    files = sorted([*folder.glob("*.c"), *folder.glob("*.h")], key=lambda file: file.name)
+    return "".join(f"{file.name} {sha256(file.read_bytes()).hexdigest()}\n" for file in files)
+
+
+def shipped_library(folder: Path, name: str, flags: Sequence[str] = ()) -> Path | None:
+    """Return the library `_<name>` of the C sources in one of the package's folders, or None.
+
+    This is the library that the package's build put beside the sources, if it was built from those that are there now
+    (an editable install outlives changes to them) and `$CTMHE_CFLAGS` asks for no build of its own; else one that is
+    compiled now from `<name>.c` and cached. None, with the reason logged, when nothing can compile it.
+    """
+    digest = sources_digest(folder)
+    if not extra_flags():
+        for place in _install_folders(folder):
+            library = _built_from(place, name, digest)
+            if library is not None:
+                return library
+    source = folder / f"{name}.c"
+    if not source.is_file() or find_compiler() is None:
+        return None
+    try:
+        return build_library(
+            name, [Source(source.name, source.read_text(), tuple(flags))], identity=digest, include=[folder]
+        )
+    except SolverError:
+        return None
+
+
+@cache
+def _install_folders(folder: Path) -> tuple[Path, ...]:
+    """Return where a folder's library may lie: beside the sources, or where an editable install puts it."""
+    folders = [folder]
+    with suppress(PackageNotFoundError):  # not installed: running from a source tree
+        inside = Path("ctmhe") / folder.relative_to(Path(__file__).parent)
+        folders.append(Path(str(distribution("ctmhe").locate_file(inside))))
+    return tuple(folders)
+
+
+def _built_from(folder: Path, name: str, digest: str) -> Path | None:
+    """Return the library in a folder if it was built from the sources with this digest."""
+    try:
+        if (folder / f"_{name}.sources").read_text() != digest:
+            return None
+    except OSError:
+        return None
+    candidates = (folder / f"_{name}{suffix}" for suffix in (".so", ".dll", ".dylib"))
+    return next((library for library in candidates if library.is_file()), None)
 
 
 # ---- compiling -----------------------------------------------------------------------------------------------------

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
-from contextlib import suppress
-from functools import cache
 from hashlib import sha256
-from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
 
-from ctmhe.compilers import NATIVE, Source, build_library, extra_flags, find_compiler
+from ctmhe.compilers import NATIVE, Source, build_library, find_compiler, shipped_library, sources_digest
 from ctmhe.errors import SolverError
 from ctmhe.solvers.tape import Tape, tape_of, written_in_c
 from ctmhe.transcription.stage import StageFunction
@@ -44,29 +41,9 @@ GENERATED = frozenset({
 })  # fmt: skip
 
 
-def core_digest() -> str:
-    """Return what identifies the core's sources: a line `name sha256` each, as the package's build writes it."""
-    files = sorted([*CORE.glob("*.c"), *CORE.glob("*.h")], key=lambda file: file.name)
-    return "".join(f"{file.name} {sha256(file.read_bytes()).hexdigest()}\n" for file in files)
-
-
 def shipped_core() -> Path | None:
-    """Return the library of the core for any sizes, or None when there is none and nothing to compile it with.
-
-    This is the library that the package's build put beside the core's sources, if it was built from the sources that
-    are there now (an editable install outlives changes to them) and `$CTMHE_CFLAGS` asks for no build of its own; else
-    one that is compiled now and cached.
-    """
-    digest = core_digest()
-    if not extra_flags():
-        for folder in _install_folders():
-            library = _built_from(folder, digest)
-            if library is not None:
-                return library
-    source = CORE / "core.c"
-    if not source.is_file():
-        return None
-    return _compiled("core", [Source("core.c", source.read_text(), ANY_SIZE)], digest)
+    """Return the library of the core for any sizes, or None when there is none and nothing to compile it with."""
+    return shipped_library(CORE, "core", ANY_SIZE)
 
 
 def specialised_core(stage: StageFunction, p_estimated: bool) -> Path | None:
@@ -104,7 +81,7 @@ def specialised_core(stage: StageFunction, p_estimated: bool) -> Path | None:
     sizes["P"] = int(p_estimated)
     if taped:
         sizes["TAPE"] = 1
-    digest = sha256(f"{core_digest()}{ca.CasadiMeta.version()}\n{flags, native, LARGE}\n".encode())
+    digest = sha256(f"{sources_digest(CORE)}{ca.CasadiMeta.version()}\n{flags, native, LARGE}\n".encode())
     digest.update(GENERATOR.read_bytes())
     for name, function in functions.items():
         digest.update(f"{name}\n{function.serialize()}\n".encode())
@@ -131,29 +108,6 @@ def _compiled(
         return build_library(name, sources, identity=identity, flags=flags, defines=defines or {}, include=[CORE])
     except SolverError:
         return None
-
-
-# ---- the library that came with the package ------------------------------------------------------------------------
-
-
-@cache
-def _install_folders() -> tuple[Path, ...]:
-    """Return where the core's library may lie: beside the sources, or where an editable install puts it."""
-    folders = [CORE]
-    with suppress(PackageNotFoundError):  # not installed: running from a source tree
-        folders.append(Path(str(distribution("ctmhe").locate_file("ctmhe/solvers/core"))))
-    return tuple(folders)
-
-
-def _built_from(folder: Path, digest: str) -> Path | None:
-    """Return the library in a folder if it was built from the sources with this digest."""
-    try:
-        if (folder / "_core.sources").read_text() != digest:
-            return None
-    except OSError:
-        return None
-    candidates = (folder / f"_core{suffix}" for suffix in (".so", ".dll", ".dylib"))
-    return next((library for library in candidates if library.is_file()), None)
 
 
 # ---- generated code ------------------------------------------------------------------------------------------------

@@ -269,12 +269,12 @@ def test_the_core_is_compiled_when_none_was_shipped(tmp_path, monkeypatch, runs)
     shutil.copytree(codegen.CORE, folder, ignore=shutil.ignore_patterns("_core*"))
     (folder / "core.c").write_text('#include "core.h"\nint answer(void) { return CTMHE_CORE_VERSION; }\n')
     monkeypatch.setattr(codegen, "CORE", folder)
-    monkeypatch.setattr(codegen, "_install_folders", lambda: (folder,))
+    monkeypatch.setattr(compilers, "_install_folders", lambda _: (folder,))
     library = shipped_core()
     assert library is not None and len(runs) == 2 and shipped_core() == library and len(runs) == 2
     shipped = folder / "_core.so"
     shutil.copy(library, shipped)
-    (folder / "_core.sources").write_text(codegen.core_digest())
+    (folder / "_core.sources").write_text(compilers.sources_digest(codegen.CORE))
     assert shipped_core() == shipped
     (folder / "core.h").write_text((folder / "core.h").read_text() + "\n")
     assert shipped_core() not in (shipped, library, None), "a library of other sources must not be used"

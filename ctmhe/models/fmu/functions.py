@@ -1,147 +1,132 @@
-"""An unpacked FMU as CasADi functions of (t, x, u, w, p) whose derivatives can be trusted."""
+"""An FMU as CasADi functions of (t, x, u, w, p), for what does not call its evaluator directly: CVODES, IPOPT."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from ctmhe.errors import FmuError
 from ctmhe.models.continuous import ARGUMENTS
-from ctmhe.models.fmu.description import MODEL_EXCHANGE, Description, Variable
+from ctmhe.models.fmu.evaluators import Evaluators
 from ctmhe.types import Array
 
-# CasADi's own directional derivatives of FMUs are silently wrong inside mapped functions (a zero seed returns
-# the previous result). Both modes are off, and every derivative is taken from one Jacobian.
+# Every derivative is taken from one Jacobian.
 NO_AD = {"enable_forward": False, "enable_reverse": False}
-# An FMU that CasADi exported may carry a symbolic copy of the model: evaluate the binary, not the copy.
-BINARY_ONLY = {"enable_ls_serialization": False}
+REACH = float(np.cbrt(np.finfo(float).eps))  # relative step of central differences
 
 
 class FmuFunctions:
-    """Makes the two functions of a model; each call instantiates the FMU anew.
+    """Makes `dynamics` and `output` of a model.
 
     Parameters
     ----------
-    folder : Path
-        Where the FMU is unpacked.
-    description : Description
-    inputs, outputs, parameters : sequence of Variable
-        What becomes u, y and p; an output may be a state.
-    values : mapping name -> value
-        Start values other than the FMU's own.
-    entry, exit : array (nx, nw), (ny, nw)
-        How w adds to the derivatives and to the outputs.
+    evaluators : Evaluators
+        Each thread's own is asked.
+    sizes : sequence of int
+        nx, nu, nw, np, ny.
+    u_nominal : array (nu,)
+        Typical magnitudes: derivatives with respect to u and t are central differences.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        description: Description,
-        *,
-        inputs: Sequence[Variable],
-        outputs: Sequence[Variable],
-        parameters: Sequence[Variable],
-        values: Mapping[str, float],
-        entry: Array,
-        exit: Array,
-    ):
-        self._about, self._entry, self._exit = description, entry, exit
-        try:
-            builder = ca.DaeBuilder(identifier(description.name), str(folder), BINARY_ONLY)
-            for category, chosen in (("u", inputs), ("p", parameters)):
-                names = [variable.name for variable in chosen]
-                for name in getattr(builder, category)():
-                    if name not in names:
-                        builder.set_category(name, "c")
-                builder.reorder(category, names)
-            builder.reorder("x", [state.name for state in description.states])
-            for name, value in values.items():
-                builder.set(name, float(value))
-            self._declared = list(builder.y())
-        except Exception as error:
-            raise _explained(description, error) from error
-        self._builder = builder
-        states = [state.name for state in description.states]
-        self._rows = [
-            self._declared.index(v.name) if v.name in self._declared else len(self._declared) + states.index(v.name)
-            for v in outputs
-        ]
+    def __init__(self, evaluators: Evaluators, sizes: Sequence[int], u_nominal: Array):
+        nx, nu, nw, n_p, ny = sizes
+        self._evaluators, self._u_nominal = evaluators, u_nominal
+        self._sizes = {"t": 1, "x": nx, "u": nu, "w": nw, "p": n_p}
+        self._kept: list[ca.Callback] = []  # CasADi holds no reference to a callback
+        self.dynamics = self._function("f", nx, lambda dx, _: dx, slice(0, nx))
+        self.output = self._function("h", ny, lambda _, y: y, slice(nx, nx + ny))
 
-    def create(self) -> tuple[ca.Function, ca.Function]:
-        """Return (dynamics, output), each of (t, x, u, w, p) with one dense output `value`."""
-        try:
-            return self._function("f", "ode", self._entry), self._function("h", "y", self._exit)
-        except Exception as error:
-            raise _explained(self._about, error) from error
+    def _function(self, name: str, rows: int, part: Callable[[Array, Array], Array], which: slice) -> ca.Function:
+        evaluators, (nx, nw) = self._evaluators, (self._sizes["x"], self._sizes["w"])
 
-    def _function(self, name: str, what: str, spread: Array) -> ca.Function:
-        inner = ["t", "x", "u", "p"]
-        value = self._builder.create(f"{name}_fmu", inner, [what], NO_AD)
-        columns = [f"jac_{what}_{key}" for key in "xup"]
-        options: dict[str, Any] = dict(NO_AD)
-        if not self._about.kinds[MODEL_EXCHANGE].directional_derivatives:
-            options["fd_method"] = "central"
-        jacobian = self._builder.create(f"jac_{name}_fmu", inner, columns, options)
-        timed = self._builder.create("timed", inner, [f"jac_{what}_t"], NO_AD).nnz_out(0) > 0
+        def value(t: Array, x: Array, u: Array, w: Array, p: Array) -> Array:
+            return part(*evaluators.mine().evaluate(t[0], x, u, w, p, jacobian=False)[:2])
 
-        nx = len(self._about.states)
-        sizes = {"t": 1, "x": nx, "u": value.size1_in(2), "w": spread.shape[1], "p": value.size1_in(3)}
-        symbols = {key: ca.MX.sym(key, sizes[key]) for key in ARGUMENTS}
-        t, x, u, w, p = symbols.values()
+        def by_t(t: Array, *rest: Array) -> Array:
+            step = REACH * max(1.0, abs(t[0]))
+            return ((value(t + step, *rest) - value(t - step, *rest)) / (2 * step))[:, None]
 
-        def evaluate(time: ca.MX) -> ca.MX:
-            return self._pick(value(time, x, u, p), x, what) + ca.DM(spread) @ w
+        def by_u(t: Array, x: Array, u: Array, w: Array, p: Array) -> Array:
+            columns = np.zeros((rows, len(u)))
+            for j, size in enumerate(self._u_nominal):
+                step = np.zeros(len(u))
+                step[j] = REACH * max(size, abs(u[j]))
+                columns[:, j] = (value(t, x, u + step, w, p) - value(t, x, u - step, w, p)) / (2 * step[j])
+            return columns
 
-        by = dict(zip("xup", jacobian(t, x, u, p), strict=True))
-        rows = spread.shape[0]
-        zero = {key: ca.MX(ca.DM(nx, sizes[key])) for key in "xup"} | {"x": ca.MX(ca.DM.eye(nx))}
-        blocks = {key: self._pick(by[key], zero[key], what) for key in "xup"}
-        blocks["w"] = ca.MX(ca.sparsify(ca.DM(spread)))
-        # The derivative in time is never asked of the FMU (generated code has been seen to crash on it); where
-        # the FMU says that time matters, it is a central difference.
-        reach = np.cbrt(np.finfo(float).eps) * ca.fmax(1, ca.fabs(t))
-        slope = (evaluate(t + reach) - evaluate(t - reach)) / (2 * reach) if timed else ca.MX(rows, 1)
-        blocks["t"] = slope
+        def jacobian(results: Sequence[Array | None], *point: Array) -> None:
+            if any(results[i] is not None for i in (1, 3, 4)):
+                J = evaluators.mine().evaluate(point[0][0], *point[1:])[2][which]
+                for i, columns in ((1, slice(0, nx)), (3, slice(nx, nx + nw)), (4, slice(nx + nw, None))):
+                    _fill(results[i], J[:, columns])
+            if results[0] is not None:
+                _fill(results[0], by_t(*point))
+            if results[2] is not None:
+                _fill(results[2], by_u(*point))
 
-        names = list(ARGUMENTS)
-        derivative = ca.Function(
+        sizes = list(self._sizes.values())
+        run = _Callback(f"{name}_fmu", sizes, [(rows, 1)], lambda results, *point: _fill(results[0], value(*point)))
+        shapes = [(rows, size) for size in sizes]
+        derive = _Callback(f"jac_{name}_fmu", [*sizes, rows], shapes, lambda results, *point: jacobian(results, *point[:5]))
+        self._kept += [run, derive]
+        symbols = [ca.MX.sym(key, size) for key, size in self._sizes.items()]
+        names = [*ARGUMENTS, "out_value"]
+        result = ca.MX.sym("out_value", rows)
+        options: dict[str, Any] = {"enable_fd": True, "fd_method": "central", **NO_AD}  # for second derivatives
+        custom = ca.Function(
             f"jac_{name}",
-            [*symbols.values(), ca.MX.sym("out_value", ca.Sparsity(rows, 1))],
-            [blocks[key] for key in ARGUMENTS],
-            [*names, "out_value"],
+            [*symbols, result],
+            derive.call([*symbols, result]),
+            names,
             [f"jac_value_{key}" for key in ARGUMENTS],
-            {
-                "enable_fd": True,
-                "fd_method": "central",
-                **NO_AD,
-            },  # second derivatives, for a solver that wants them
+            options,
         )
         return ca.Function(
             name,
-            list(symbols.values()),
-            [ca.densify(evaluate(t))],
-            names,
+            symbols,
+            run.call(symbols),
+            list(ARGUMENTS),
             ["value"],
-            {"custom_jacobian": derivative, "never_inline": True, **NO_AD},
+            {"custom_jacobian": custom, "never_inline": True, **NO_AD},
         )
 
-    def _pick(self, declared: ca.MX, states: ca.MX, what: str) -> ca.MX:
-        return ca.vertcat(declared, states)[self._rows, :] if what == "y" else declared
+
+def _fill(result: Array | None, value: Array) -> None:
+    if result is not None:
+        result[:] = value.ravel(order="F")
 
 
-def identifier(name: str) -> str:
-    """Return `name` as a CasADi name: letters, digits and single underscores."""
-    words = "".join(c if c.isascii() and c.isalnum() else " " for c in name).split()
-    return "_".join(["fmu", *words])
+class _Callback(ca.Callback):
+    """Hands the memory of arguments and wanted results over as arrays; None for a result that is not wanted."""
 
+    def __init__(
+        self, name: str, sizes: Sequence[int], shapes: Sequence[tuple[int, int]], function: Callable[..., None]
+    ):
+        ca.Callback.__init__(self)
+        self._sizes, self._shapes, self._function = sizes, shapes, function
+        self.construct(name, {})
 
-def _explained(description: Description, error: Exception) -> FmuError:
-    text = " ".join(str(error).split())
-    hint = ""
-    if "dependencies" in text and "not implemented" in text:
-        hint = ": its modelDescription.xml lists no `dependencies` of outputs and derivatives; export it with them"
-    return FmuError(f"{description.name} cannot be evaluated by CasADi{hint} ({text[-400:]})")
+    def get_n_in(self) -> int:  # noqa: D102
+        return len(self._sizes)
+
+    def get_n_out(self) -> int:  # noqa: D102
+        return len(self._shapes)
+
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:  # noqa: D102
+        return ca.Sparsity.dense(self._sizes[i], 1)
+
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:  # noqa: D102
+        return ca.Sparsity.dense(*self._shapes[i])
+
+    def has_eval_buffer(self) -> bool:  # noqa: D102
+        return True
+
+    def eval_buffer(self, arguments: Sequence[Any], results: Sequence[Any]) -> int:  # noqa: D102
+        given = [np.frombuffer(a) if a is not None else np.zeros(n) for a, n in zip(arguments, self._sizes, strict=True)]
+        try:
+            self._function([None if r is None else np.frombuffer(r) for r in results], *given)
+        except FloatingPointError:
+            return 1
+        return 0
