@@ -12,7 +12,7 @@ import numpy as np
 from ctmhe.errors import FmuError, InputError
 from ctmhe.models.fmu.archive import Unpacked
 from ctmhe.models.fmu.description import CO_SIMULATION, MODEL_EXCHANGE, Description, Variable, signals_of
-from ctmhe.models.fmu.instance import read_description
+from ctmhe.models.fmu.reading import read_description
 from ctmhe.models.signals import Signals
 from ctmhe.simulation._fmu_engines import CoSimulation, Engine, ModelExchange
 from ctmhe.types import Array, Values, finite_time, frozen

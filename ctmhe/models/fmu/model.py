@@ -12,7 +12,7 @@ from ctmhe.errors import FmuError, InputError
 from ctmhe.models.fmu.archive import Unpacked
 from ctmhe.models.fmu.description import CO_SIMULATION, MODEL_EXCHANGE, Description, Variable, signals_of
 from ctmhe.models.fmu.functions import FmuFunctions
-from ctmhe.models.fmu.instance import read_description
+from ctmhe.models.fmu.reading import read_description
 from ctmhe.models.fmu.truth import Choice, Reference, check
 from ctmhe.models.signals import Signals
 from ctmhe.types import Bounds, frozen
