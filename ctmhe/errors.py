@@ -73,3 +73,7 @@ class MissingExtra(CtmheError, ImportError):
     def __init__(self, library: str, extra: str, purpose: str):
         super().__init__(f"{purpose} needs {library}, which is not installed: pip install 'ctmhe[{extra}]'")
         self.library, self.extra = library, extra
+
+
+class FmuWarning(UserWarning):
+    """Something about an FMU is wrong and was worked around; the text names it."""

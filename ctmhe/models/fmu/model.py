@@ -1,152 +1,193 @@
-"""FMUs as models: FMI 2.0 and 3.0 model exchange, evaluated and differentiated by CasADi."""
+"""FMUs as models: model exchange in continuous time, co-simulation as a step map in discrete time."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ctmhe.errors import FmuError, InputError
+from ctmhe.errors import FmuError, FmuEventError, FmuWarning, InputError
 from ctmhe.models.fmu.archive import Unpacked
-from ctmhe.models.fmu.description import CO_SIMULATION, MODEL_EXCHANGE, Description, Variable, signals_of
+from ctmhe.models.fmu.choice import Choice, Names, choose
+from ctmhe.models.fmu.description import Description
+from ctmhe.models.fmu.evaluators import Evaluator, Evaluators, Worker
 from ctmhe.models.fmu.functions import FmuFunctions
 from ctmhe.models.fmu.reading import read_description
-from ctmhe.models.fmu.truth import Choice, Reference, check
+from ctmhe.models.fmu.reference import Reference
+from ctmhe.models.fmu.truth import Examination, Point, same_when_mapped
 from ctmhe.models.signals import Signals
 from ctmhe.types import Bounds, frozen
 
+CHECKS = ("full", "fast", "off")
+PATIENCE = 10.0  # seconds that an isolated FMU may take for one evaluation
+
 
 class FmuModel:
-    """dx/dt = f(t, x, u, p) + w, y = h(t, x, u, p) (+ v) of a model-exchange FMU: thesis (3.7), with p.
+    """dx/dt = f(t, x, u, p) + w, y = h(t, x, u, p) (+ v) of an FMU: thesis (3.7), with p.
 
-    The archive is unpacked into a private temporary folder that lives as long as the model, or until `close`.
-    Pickles as its configuration: path, hash of the file's contents, arguments.
+    An FMU of co-simulation is a step map, x(t + step) = f(x, u, p) + w, like a `DiscreteModel` (thesis (3.1)): each
+    step starts from the state that the FMU had after its initialization, with x, u and p set. What else it remembers
+    (discrete variables, the integrator's own memory) is as it was there, and it must not depend on time.
+
+    The archive is unpacked into a private temporary folder that lives as long as the model, or until `close`. The
+    binary is loaded in another process first. Pickles as its configuration: path, hash of the file, arguments.
 
     Parameters
     ----------
     path : str or Path
-        The .fmu file, FMI 2.0 or 3.0 with model exchange.
-    inputs : sequence of str, optional
-        Inputs that become `u`; all when left out. The others keep their start values.
-    outputs : sequence of str, optional
-        Outputs, or states, that become `y`; all outputs when left out.
-    parameters : sequence of str
-        Tunable parameters that become `p`. The others keep their values.
-    disturbances : sequence of str, optional
-        States whose derivatives a disturbance `w_<state>` is added to; all when left out.
+        The .fmu file, FMI 2.0 or 3.0.
+    kind : {"ModelExchange", "CoSimulation"}, optional
+        Model exchange where the FMU has it and no step is given, when left out.
+    step : float, optional
+        Seconds, of co-simulation.
+    inputs, outputs, states, parameters : str or sequence of str, optional
+        What becomes u, y, x (co-simulation only; else all continuous states) and p: names, patterns (`zone*.T`) and
+        selectors (`causality:output`, `variability:tunable`). Inputs and outputs: all when left out; an output may be
+        any real variable. Inputs that are left out keep their start values. Only tunable parameters can be estimated.
+    disturbances : str or sequence of str, optional
+        What w adds to, in the FMU's units: states (`w_<state>`, added to the derivative, per second, or to the next
+        state), inputs (`w_<input>`, added to the value), outputs (`v_<output>`). All states when left out.
     output_noise : bool
-        Whether `w` also holds a `v_<output>` added to each output.
+        Whether `w` also holds a `v_<output>` for each output.
     start : mapping name -> value, optional
         Values of states, inputs and parameters to start with instead of the FMU's own.
     allow_frozen_events : bool
         Accept an FMU with events; its discrete variables then stay as they are after initialization.
+    check : {"full", "fast", "off"}
+        How thoroughly values and derivatives are compared with the FMU's own: at three points, at the start, not.
+    isolated : bool or float
+        Run the FMU in a process of its own, so that its crash or hang (longer than so many seconds, 10 for True) is a
+        failed evaluation. Some 10 microseconds more per evaluation.
 
     Attributes
     ----------
     x, u, w, p, y : Signals
-        Units and nominals are the FMU's; those of `w_<state>` are per second.
+        Units and nominals are the FMU's.
     dynamics, output : casadi.Function
-        Of (t, x, u, w, p). The derivative with respect to t is a finite difference.
+        Of (t, x, u, w, p). Derivatives with respect to t and u are finite differences.
     x_start, u_start, p_start : array (nx,), (nu,), (np,)
         Values after initialization.
     description : Description
+    warnings : tuple of str
+        What was found wrong and worked around.
     exact_derivatives : bool
-        The FMU computes directional derivatives; otherwise Jacobians are central differences.
+        All of x, p and disturbed inputs have directional derivatives; otherwise some are central differences.
     single_instance : bool
         The FMU allows one instance per process (`canBeInstantiatedOnlyOncePerProcess`): no threads.
 
     Raises
     ------
-    FmuError
-        If the FMU cannot be unpacked, read, loaded or evaluated, has no model exchange or no states, has events,
-        or if CasADi's values or Jacobians differ from the FMU's own; the message names the variable.
+    FmuArchiveError, FmuVersionError, FmuKindError, FmuBinaryError, FmuUnsupportedError, FmuEventError,
+    FmuParameterError, FmuDerivativeError
+        In the order of the checks; all are `FmuError`, name the variable or entry, and say what to do.
     InputError
         If a name is unknown; the message suggests the nearest.
     """
-
-    step: float | None = None
 
     def __init__(
         self,
         path: str | Path,
         *,
-        inputs: Sequence[str] | None = None,
-        outputs: Sequence[str] | None = None,
-        parameters: Sequence[str] = (),
-        disturbances: Sequence[str] | None = None,
+        kind: str | None = None,
+        step: float | None = None,
+        inputs: Names = None,
+        outputs: Names = None,
+        states: Names = None,
+        parameters: Names = (),
+        disturbances: Names = None,
         output_noise: bool = False,
         start: Mapping[str, float] | None = None,
         allow_frozen_events: bool = False,
+        check: str = "full",
+        isolated: bool | float = False,
     ):
-        self._arguments: dict[str, Any] = {
+        if check not in CHECKS:
+            raise InputError(f"check: expected one of {', '.join(CHECKS)}, got {check!r}")
+        choice: dict[str, Any] = {
+            "kind": kind,
+            "step": step,
             "inputs": inputs,
             "outputs": outputs,
+            "states": states,
             "parameters": parameters,
             "disturbances": disturbances,
             "output_noise": output_noise,
             "start": dict(start or {}),
-            "allow_frozen_events": allow_frozen_events,
         }
+        others = {"allow_frozen_events": allow_frozen_events, "check": check, "isolated": isolated}
+        self._arguments: dict[str, Any] = choice | others
+        self._evaluators: Evaluators | None = None
         self._archive = Unpacked(path)
         self.path = self._archive.path
         try:
-            self._build(disturbances, output_noise)
+            self.description = read_description(self._archive.folder)
+            self._build(choose(self.description, **choice), **others)
         except BaseException:
             self.close()
             raise
 
-    def _build(self, disturbances: Sequence[str] | None, output_noise: bool) -> None:
-        self.description = about = read_description(self._archive.folder)
-        self.name, self.bounds = about.name, Bounds()
-        check_suitable(about)
-        self.exact_derivatives = about.kinds[MODEL_EXCHANGE].directional_derivatives
-        self.single_instance = about.kinds[MODEL_EXCHANGE].single_instance
+    def _build(self, choice: Choice, *, allow_frozen_events: bool, check: str, isolated: bool | float) -> None:
+        about, folder = choice.about, self._archive.folder
+        self.name, self.bounds, self.step = about.name, Bounds(), choice.step
+        self.single_instance = about.kinds[choice.kind].single_instance
+        signals = choice.signals()
+        self.x, self.u, self.w, self.p, self.y = (signals[key] for key in "xuwpy")
+        seconds = None if isolated is False else PATIENCE if isolated is True else float(isolated)
 
-        inputs, outputs, parameters = self._select(about)
-        values = start_values(about, self._arguments["start"])
-        disturbed = about.select("state", disturbances, about.states)
-        noisy = outputs if output_noise else ()
-        self.x, self.u = signals_of("state", about.states), signals_of("input", inputs)
-        self.p, self.y = signals_of("parameter", parameters), signals_of("output", outputs)
-        self.w = disturbance_signals(disturbed, noisy)
+        configuration = choice.configuration(folder)
+        references = [v.reference for v in choice.read_at_start]
+        probe = Worker(configuration, references)
+        probe.close()
+        check_events(choice, probe.next_event, allowed=allow_frozen_events)
+        nx, nu, nv = len(choice.states), len(choice.inputs), len(choice.driven)
+        values = [choice.values.get(v.name, found) for v, found in zip(choice.read_at_start, probe.values, strict=True)]
+        self.x_start, self.u_start = frozen(values[:nx]), frozen(values[nx : nx + nu])
+        self.p_start = frozen(values[nx + nv :])
+        configuration = choice.configuration(folder, values[nx : nx + nv])
 
-        reference = Reference(about, self._archive.folder, values)
-        event, starts = reference.start(about.states, inputs, parameters)
-        check_events(about, event, allowed=self._arguments["allow_frozen_events"])
-        self.x_start, self.u_start, self.p_start = (frozen(start) for start in starts)
+        found: tuple[str, ...] = ()
+        points: tuple[Point, ...] = ()
+        if check != "off":
+            start = Point(about.start_time or 0.0, self.x_start, self.u_start, self.p_start)
+            examination = Examination(
+                choice,
+                Reference(choice, folder),
+                configuration,
+                start,
+                seconds=seconds,
+                thorough=check == "full",
+            )
+            findings = examination.run()
+            configuration, found, points = findings.configuration, findings.warnings, findings.usable
+        self.warnings = found
+        differenced = configuration["differenced"], configuration["rows_differenced"]
+        self.exact_derivatives = bool(configuration["directional"]) and not any(map(any, differenced))
+        self._evaluators = Evaluators(configuration, references, alone=self.single_instance, seconds=seconds)
+        sizes = tuple(configuration[key] for key in ("nx", "nu", "nw", "np", "ny"))
+        functions = FmuFunctions(self._evaluators, sizes, self.u.nominal)
+        self._functions, self.dynamics, self.output = functions, functions.dynamics, functions.output
+        if check == "full":
+            same_when_mapped(self.name, self.dynamics, points, self.x.names, len(self.w))
+        for text in found:
+            warnings.warn(text, FmuWarning, stacklevel=4)
 
-        none = np.zeros
-        functions = FmuFunctions(
-            self._archive.folder,
-            about,
-            inputs=inputs,
-            outputs=outputs,
-            parameters=parameters,
-            values=values,
-            entry=np.hstack([incidence(about.states, disturbed), none((len(self.x), len(noisy)))]),
-            exit=np.hstack([none((len(self.y), len(disturbed))), incidence(outputs, noisy)]),
-        )
-        choice = Choice(inputs, outputs, parameters, self.x_start, self.u_start, self.p_start)
-        check(about, reference, functions, choice)
-        self.dynamics, self.output = functions.create()
+    def evaluator(self) -> Evaluator:
+        """Return this thread's evaluator, which solvers call without CasADi."""
+        if self._evaluators is None:
+            raise FmuError(f"{self.path.name} is closed: build the model again")
+        return self._evaluators.mine()
 
-    def _select(self, about: Description) -> tuple[tuple[Variable, ...], ...]:
-        wanted = self._arguments["outputs"]
-        known = {v.name: v for v in about.outputs + (about.states if wanted is not None else ())}
-        outputs = about.select("output", wanted, tuple(known.values()))
-        if not outputs:
-            raise FmuError(f"{about.name} has no real output; name measured states: outputs=[{about.states[0].name!r}]")
-        parameters = about.select("parameter", self._arguments["parameters"], about.parameters)
-        for parameter in parameters:
-            if parameter.variability != "tunable":
-                raise FmuError(
-                    f"{about.name}: parameter {parameter.name!r} is {parameter.variability}, only tunable "
-                    f"parameters can be estimated; set it with start={{{parameter.name!r}: ...}}, or export the "
-                    "FMU with it tunable"
-                )
-        return about.select("input", self._arguments["inputs"], about.inputs), outputs, parameters
+    def failures(self) -> tuple[str, ...]:
+        """Return what went wrong in this thread's evaluations since this was asked last, in words."""
+        evaluator = self.evaluator()
+        count = evaluator.new_failures()
+        if not count:
+            return ()
+        times = "once" if count == 1 else f"{count} times, last"
+        return (f"the FMU could not be evaluated ({times}: {evaluator.message()})",)
 
     def __repr__(self) -> str:
         rows = [f"FmuModel {self.name!r} (FMI {self.description.version}, {self.path.name})"]
@@ -161,7 +202,10 @@ class FmuModel:
         return _reopen, (str(self.path), self._archive.digest, self._arguments)
 
     def close(self) -> None:
-        """Remove the temporary folder; the model and its functions must not be used any more."""
+        """Free the FMU and remove its temporary folder; the model must not be used any more."""
+        if self._evaluators is not None:
+            self._evaluators.close()
+            self._evaluators = None
         self._archive.close()
 
 
@@ -173,85 +217,14 @@ def _reopen(path: str, digest: str, arguments: dict[str, Any]) -> FmuModel:
     return model
 
 
-def check_suitable(about: Description) -> None:
-    """Raise `FmuError` when an FMU cannot serve an estimator, judged by its description alone."""
-    if MODEL_EXCHANGE not in about.kinds:
-        has = f"{CO_SIMULATION} only" if CO_SIMULATION in about.kinds else "neither kind"
-        raise FmuError(
-            f"{about.name} offers {has}; an estimator needs model exchange: export it as such, or use it as the "
-            "plant (FmuPlant)"
-        )
-    for name, what in about.unsupported.items():
-        raise FmuError(f"{about.name}: variable {name!r} is {what}, which is not supported; export it with scalars")
-    if not about.states:
-        raise FmuError(f"{about.name} has no continuous states, so there is nothing to estimate")
-
-
-def check_events(about: Description, next_time: float, *, allowed: bool) -> None:
-    """Raise `FmuError` when an FMU has events and freezing them is not allowed."""
-    if allowed or (about.event_indicators == 0 and not np.isfinite(next_time)):
+def check_events(choice: Choice, next_time: float, *, allowed: bool) -> None:
+    """Raise `FmuEventError` when an FMU has events and freezing them is not allowed."""
+    about = choice.about
+    if allowed or not choice.exchange or (about.event_indicators == 0 and not np.isfinite(next_time)):
         return
     count = about.event_indicators
     what = f"{count} event indicator{'s' * (count > 1)}" if count else f"a time event at t = {next_time}"
-    raise FmuError(
+    raise FmuEventError(
         f"{about.name} has {what}; inside an estimator its discrete variables would stay frozen. If that is "
         "acceptable in the range of interest, say allow_frozen_events=True; as the plant (FmuPlant) events are handled"
     )
-
-
-def start_values(about: Description, start: Mapping[str, float]) -> dict[str, float]:
-    """Return checked start values by name."""
-    known = tuple(v for v in about.variables.values() if v.settable or v in about.states)
-    values = {}
-    for variable, value in zip(about.select("start value", list(start), known), start.values(), strict=True):
-        if not np.isfinite(value):
-            raise InputError(f"start: {variable.name!r} is {value}, not finite")
-        values[variable.name] = float(value)
-    return values
-
-
-def disturbance_signals(disturbed: Sequence[Variable], noisy: Sequence[Variable]) -> Signals:
-    """Return `w_<state>` for every disturbed state, then `v_<output>` for every noisy output."""
-    process, noise = signals_of("w", disturbed, "w_", per_second=True), signals_of("v", noisy, "v_")
-    nominal = frozen([*process.nominal, *noise.nominal])
-    return Signals("disturbance", process.names + noise.names, process.units + noise.units, nominal)
-
-
-def incidence(rows: Sequence[Variable], columns: Sequence[Variable]) -> np.ndarray:
-    """Return the matrix (rows, columns) with 1 where both are the same variable."""
-    return np.array([[float(row.name == column.name) for column in columns] for row in rows]).reshape(len(rows), -1)
-
-
-def describe(path: str | Path) -> str:
-    """Return what an FMU says of itself, as text for a person: version, kinds, signals with units and start values."""
-    archive = Unpacked(path)
-    try:
-        found = read_description(archive.folder)
-    finally:
-        archive.close()
-    flags = {
-        "directional derivatives": "directional_derivatives",
-        "get/set state": "get_set_state",
-        "one instance a process": "single_instance",
-    }
-    lines = [f"{found.name}: FMI {found.version}, made by {found.tool or 'an unnamed tool'}"]
-    for kind, interface in found.kinds.items():
-        offers = [label for label, field in flags.items() if getattr(interface, field)]
-        lines.append(f"  {kind}: {', '.join(offers) or 'nothing optional'}")
-    lines.append(f"  event indicators: {found.event_indicators}")
-    for title, variables in (
-        ("states", found.states),
-        ("inputs", found.inputs),
-        ("outputs", found.outputs),
-        ("parameters", found.parameters),
-    ):
-        lines.append(f"{title} ({len(variables)})" + ("" if variables else ": none"))
-        width = max((len(variable.name) for variable in variables), default=0)
-        for variable in variables:
-            unit = f" [{variable.unit}]" if variable.unit else ""
-            start = "" if variable.start is None else f" = {variable.start:g}"
-            kind = f", {variable.variability}" if title == "parameters" else ""
-            lines.append(f"  {variable.name:<{width}}{start}{unit}{kind}")
-    for name, reason in found.unsupported.items():
-        lines.append(f"not usable: {name} ({reason})")
-    return "\n".join(lines)
