@@ -1,4 +1,4 @@
-"""The command line: `ctmhe demo`, `estimate`, `fmu info`, `reproduce`."""
+"""The command line: `ctmhe demo`, `estimate`, `fmu info`, `fmu build`, `reproduce`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-fmu_app = typer.Typer(help="Look into FMUs.", no_args_is_help=True)
+fmu_app = typer.Typer(help="Look into FMUs, and compile them.", no_args_is_help=True)
 app.add_typer(fmu_app, name="fmu")
 
 
@@ -90,6 +90,19 @@ def fmu_info(path: Annotated[Path, typer.Argument(help="The FMU.")]) -> None:
     from ctmhe.models.fmu import describe
 
     typer.echo(describe(path))
+
+
+@fmu_app.command("build")
+def fmu_build(
+    path: Annotated[Path, typer.Argument(help="An FMU with C sources.")],
+    out: Annotated[
+        Path | None, typer.Option(help="The FMU to write; beside the given one, with the platform in its name.")
+    ] = None,
+) -> None:
+    """Compile the C sources of an FMU for this platform, into a new FMU."""
+    from ctmhe.models.fmu.building import build
+
+    typer.echo(f"written: {build(path, out)}")
 
 
 @app.command()

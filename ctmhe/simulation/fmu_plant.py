@@ -263,8 +263,11 @@ def chosen_kind(about: Description, kind: str | None) -> str:
 def plant_parameters(about: Description, values: Mapping[str, float]) -> dict[str, float]:
     """Return checked values, by name, of variables that may be set at initialization."""
     known: tuple[Variable, ...] = tuple(v for v in about.variables.values() if v.settable and v.causality != "input")
-    chosen = about.select("parameter", list(values), known)
-    numbers = {v.name: float(value) for v, value in zip(chosen, values.values(), strict=True)}
+    numbers = {
+        variable.name: float(value)
+        for name, value in values.items()
+        for variable in about.select("parameter", name, known)
+    }
     for name, value in numbers.items():
         if not np.isfinite(value):
             raise InputError(f"FmuPlant: parameter {name!r} is {value}, not finite")
