@@ -16,9 +16,10 @@ from ctmhe.errors import SolverError
 from ctmhe.solvers.tape import BATCH, tape_of
 from ctmhe.transcription.stage import StageFunction
 
-VERSION = 6
+VERSION = 7
 MAX_ARGUMENTS = 64
 CONVERGED, ITERATION_LIMIT, NOT_FINITE, NO_DECREASE, SINGULAR, DEADLINE = range(6)
+METHODS = {"step map": 0, "RK4": 1}
 STAGE_FUNCTIONS = ("ctmhe_stage_value", "ctmhe_stage_jacobian", "ctmhe_stage_curvature")
 
 _pointer, _int, _double = ctypes.c_void_p, ctypes.c_int, ctypes.c_double
@@ -33,7 +34,9 @@ class Function(ctypes.Structure):
 
     _fields_ = [
         *((name, _pointer) for name in ("batch", "function", "iw", "w", "tape", "constants", "registers")),
-        ("tape_length", _int), ("sizes", _int * 3), ("eval", _pointer), ("self", _pointer), ("failed", _pointer),
+        ("tape_length", _int), ("sizes", _int * 3),
+        ("evaluate", _pointer), ("model", _pointer), ("work", _pointer), ("method", _int),
+        ("eval", _pointer), ("self", _pointer), ("failed", _pointer),
         ("arg", _pointer * 9), ("res", _pointer * 3),
     ]  # fmt: skip
 
@@ -135,8 +138,8 @@ class Functions:
 
     def __init__(self, core: ctypes.CDLL, stage: StageFunction):
         self.kept: list[Any] = []
-        functions = [group[1] for group in stage.mapped]
-        structures = []
+        functions = [] if stage.method is not None else [group[1] for group in stage.mapped]
+        structures = [self._own(stage)] * 2 if stage.method is not None else []
         for name, function in zip(STAGE_FUNCTIONS, functions, strict=False):
             batch = getattr(core, name.replace("_stage_", "_batch_"), None)
             if batch is not None:
@@ -149,6 +152,18 @@ class Functions:
                 structures.append((None if alone else self._taped(function)) or self._virtual(stage, function))
         sizes = (stage.nx, stage.nw, stage.np, stage.nu, stage.ny, stage.q, stage.steps)
         self.structure = Stage(*sizes, stage.step_length, bool(stage.symbolic), *structures)
+
+    def _own(self, stage: StageFunction) -> Function:
+        evaluator = stage.model.evaluator()  # pyright: ignore
+        nx, n = stage.nx, stage.nx + stage.nw + stage.np
+        work = np.zeros(4 * nx + stage.ny + (4 * nx + stage.ny) * n)
+        self.kept += [evaluator, work]
+        return Function(
+            evaluate=evaluator.address,
+            model=evaluator.pointer,
+            work=work.ctypes.data,
+            method=METHODS[stage.method or ""],
+        )
 
     def _compiled(self, core: ctypes.CDLL, name: str) -> Function:
         sizes = (ctypes.c_longlong * 4)()

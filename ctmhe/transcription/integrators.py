@@ -71,6 +71,7 @@ class RK4:
     nodes = np.array([0.0, 0.5, 0.5, 1.0])
     weights = np.array([1.0, 2.0, 2.0, 1.0]) / 6.0
     accuracy = ROUND_OFF
+    method = "RK4"
 
     def __post_init__(self) -> None:
         positive("RK4: step", self.step, "seconds")
@@ -159,6 +160,7 @@ class StepMap:
     nodes = np.empty(0)
     weights = np.empty(0)
     accuracy = ROUND_OFF
+    method = "step map"
 
     def parts(self, interval: float) -> int:
         """Return 1: a cell is a step."""

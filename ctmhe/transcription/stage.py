@@ -63,6 +63,9 @@ class StageFunction:
         Relative accuracy of an evaluation.
     value, derivative : casadi.Function
         One step: (t, h, x, w, p, u0, u1) -> (x_next, vec y), and the same with the Jacobian as a third result.
+    method : str or None
+        How the core integrates a model that evaluates itself (`FmuModel.evaluator`): None for other models, and for
+        integrators that the core does not have.
     symbolic : bool
         The functions are expanded scalar expressions: exact second derivatives are at hand.
     """
@@ -75,6 +78,9 @@ class StageFunction:
         self.steps = 1 if interval is None else integrator.parts(interval)
         self.step_length = np.inf if interval is None else interval / self.steps
         self.q = self.steps * len(self.nodes) + 1
+        self.model = model
+        own = getattr(model, "evaluator", None) is not None
+        self.method = getattr(integrator, "method", None) if own else None
         step = integrator.trace(model, signal)
         symbolic = step.is_a("SXFunction")
         kind: Any = ca.SX if symbolic else ca.MX

@@ -22,7 +22,6 @@ from ctmhe.models.fmu.description import (
 from ctmhe.models.fmu.functions import REACH
 from ctmhe.models.signals import Signals
 
-
 Names = Iterable[str] | str | None
 
 
@@ -212,8 +211,8 @@ def choose(
     for parameter in chosen_parameters:
         if parameter.variability != "tunable":
             raise FmuParameterError(
-                f"{about.name}: parameter {parameter.name!r} is {parameter.variability}, only tunable parameters can be "
-                f"estimated; set it with start={{{parameter.name!r}: ...}}, or export the FMU with it tunable"
+                f"{about.name}: parameter {parameter.name!r} is {parameter.variability}, only tunable parameters can "
+                f"be estimated; set it with start={{{parameter.name!r}: ...}}, or export the FMU with it tunable"
             )
     known = {v.name: v for v in (*chosen_states, *about.inputs, *chosen_outputs)}
     named = chosen_states if disturbances is None else about.select("disturbance", disturbances, tuple(known.values()))
@@ -273,10 +272,7 @@ def start_values(about: Description, start: Mapping[str, float], states: Sequenc
     known = tuple(v for v in about.variables.values() if v.settable or v in states)
     values = {}
     for name, value in start.items():
-        (variable,) = about.select("start value", [name], known)
         if not np.isfinite(value):
-            raise InputError(f"start: {variable.name!r} is {value}, not finite")
-        values[variable.name] = float(value)
+            raise InputError(f"start: {name!r} is {value}, not finite")
+        values |= {variable.name: float(value) for variable in about.select("start value", [name], known)}
     return values
-
-

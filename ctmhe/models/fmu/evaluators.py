@@ -127,8 +127,8 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 def unusable(name: str, reason: str) -> FmuBinaryError:
     """Return the error of an FMU that cannot be opened."""
     return FmuBinaryError(
-        f"{name} cannot be opened: {reason}. Its binary has to be for this system ({sys.platform}) and to belong to its "
-        "modelDescription.xml: export the FMU again, or compile its sources (ctmhe fmu build)"
+        f"{name} cannot be opened: {reason}. Its binary has to be for this system ({sys.platform}) and to belong to "
+        "its modelDescription.xml: export the FMU again, or compile its sources (ctmhe fmu build)"
     )
 
 
@@ -281,8 +281,8 @@ class Evaluators:
         with self._lock:
             if self.alone and self.seconds is None and len(self._all):
                 raise FmuUnsupportedError(
-                    f"{name} allows one instance in a process (canBeInstantiatedOnlyOncePerProcess), and another thread "
-                    "has it: use one thread, worker processes, or isolated=True"
+                    f"{name} allows one instance in a process (canBeInstantiatedOnlyOncePerProcess), and another "
+                    "thread has it: use one thread, worker processes, or isolated=True"
                 )
             found = Evaluator(self.configuration, self.references, self.seconds)
             self._all.add(found)

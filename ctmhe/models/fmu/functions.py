@@ -69,7 +69,9 @@ class FmuFunctions:
         sizes = list(self._sizes.values())
         run = _Callback(f"{name}_fmu", sizes, [(rows, 1)], lambda results, *point: _fill(results[0], value(*point)))
         shapes = [(rows, size) for size in sizes]
-        derive = _Callback(f"jac_{name}_fmu", [*sizes, rows], shapes, lambda results, *point: jacobian(results, *point[:5]))
+        derive = _Callback(
+            f"jac_{name}_fmu", [*sizes, rows], shapes, lambda results, *point: jacobian(results, *point[:5])
+        )
         self._kept += [run, derive]
         symbols = [ca.MX.sym(key, size) for key, size in self._sizes.items()]
         names = [*ARGUMENTS, "out_value"]
@@ -108,25 +110,26 @@ class _Callback(ca.Callback):
         self._sizes, self._shapes, self._function = sizes, shapes, function
         self.construct(name, {})
 
-    def get_n_in(self) -> int:  # noqa: D102
+    def get_n_in(self) -> int:
         return len(self._sizes)
 
-    def get_n_out(self) -> int:  # noqa: D102
+    def get_n_out(self) -> int:
         return len(self._shapes)
 
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:  # noqa: D102
+    def get_sparsity_in(self, i: int) -> ca.Sparsity:
         return ca.Sparsity.dense(self._sizes[i], 1)
 
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:  # noqa: D102
+    def get_sparsity_out(self, i: int) -> ca.Sparsity:
         return ca.Sparsity.dense(*self._shapes[i])
 
-    def has_eval_buffer(self) -> bool:  # noqa: D102
+    def has_eval_buffer(self) -> bool:
         return True
 
-    def eval_buffer(self, arguments: Sequence[Any], results: Sequence[Any]) -> int:  # noqa: D102
-        given = [np.frombuffer(a) if a is not None else np.zeros(n) for a, n in zip(arguments, self._sizes, strict=True)]
+    def eval_buffer(self, arg: Sequence[Any], res: Sequence[Any]) -> int:
+        pairs = zip(arg, self._sizes, strict=True)
+        given = [np.zeros(size) if argument is None else np.frombuffer(argument) for argument, size in pairs]
         try:
-            self._function([None if r is None else np.frombuffer(r) for r in results], *given)
+            self._function([None if result is None else np.frombuffer(result) for result in res], *given)
         except FloatingPointError:
             return 1
         return 0

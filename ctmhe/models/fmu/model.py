@@ -12,7 +12,6 @@ import numpy as np
 from ctmhe.errors import FmuError, FmuEventError, FmuWarning, InputError
 from ctmhe.models.fmu.archive import Unpacked
 from ctmhe.models.fmu.choice import Choice, Names, choose
-from ctmhe.models.fmu.description import Description
 from ctmhe.models.fmu.evaluators import Evaluator, Evaluators, Worker
 from ctmhe.models.fmu.functions import FmuFunctions
 from ctmhe.models.fmu.reading import read_description

@@ -137,15 +137,13 @@ class Examination:
         held = [usable[i]._replace(p=start) for i in order]
         moved = [usable[i] for i in order]
         expected = [truth[i] for i in order]
-        if len(start):
-            expected_held = [np.concatenate(self.reference.evaluate(*point)) for point in held]
-        else:
-            expected_held = expected
+        expected_held = [np.concatenate(self.reference.evaluate(*point)) for point in held] if len(start) else expected
         wrong = self._mismatch(self.configuration, held, expected_held)
         if wrong:
             raise FmuDerivativeError(
                 f"{self.name}: {wrong}, so it cannot be used in an estimator. Its values may be stale after a set, or "
-                "depend on what was evaluated before: export the FMU with a newer tool, or use it as the plant (FmuPlant)"
+                "depend on what was evaluated before: export the FMU with a newer tool, or use it as the plant "
+                "(FmuPlant)"
             )
         if len(start):
             self._find_parameter_mode(moved, expected)
@@ -231,7 +229,9 @@ class Examination:
                 self._choose_reach(slopes)
                 wrong = self._wrong(points, slopes)
         if wrong and self.configuration["directional"]:
-            said = "; ".join(f"d {row} / d {column} is {has:.6g} and not {should:.6g}" for row, column, _, has, should in wrong[:3])
+            said = "; ".join(
+                f"d {row} / d {column} is {has:.6g} and not {should:.6g}" for row, column, _, has, should in wrong[:3]
+            )
             self.warnings.append(
                 f"{self.name}: its directional derivatives are wrong: {said}{'; ...' if len(wrong) > 3 else ''}. "
                 "Derivatives with respect to "
@@ -244,9 +244,10 @@ class Examination:
         if wrong:
             row, column, _, has, should = wrong[0]
             raise FmuDerivativeError(
-                f"{self.name}: the derivative of {row!r} with respect to {column!r} is {has:.6g}, but finite differences "
-                f"give {should:.6g}; an estimator would go wrong. {row!r} may be rough or jump in {column!r}: export "
-                "the FMU with directional derivatives, or with tighter tolerances of its own solvers"
+                f"{self.name}: the derivative of {row!r} with respect to {column!r} is {has:.6g}, but finite "
+                f"differences give {should:.6g}; an estimator would go wrong. {row!r} may be rough or "
+                f"jump in {column!r}: export the FMU with directional derivatives, or with tighter "
+                "tolerances of its own solvers"
             )
 
     def _slopes(self, point: Point) -> dict[float, tuple[dict[str, Array], dict[str, Array]]]:
@@ -395,11 +396,16 @@ def same_when_mapped(name: str, function: ca.Function, points: Sequence[Point], 
     chain = mapped[1] + 0.01 * function.map(3)(*mapped)
     derivative = ca.Function("J", mapped, [ca.jacobian(ca.vec(chain), ca.vec(mapped[i])) for i in (1, 4)])
     arguments = [[s.t, s.x, s.u, np.zeros(nw), s.p] for s in stages]
-    together = [np.asarray(ca.DM(v)) for v in derivative.call([np.column_stack(c) for c in zip(*arguments, strict=True)])]
+    together = [
+        np.asarray(ca.DM(v)) for v in derivative.call([np.column_stack(c) for c in zip(*arguments, strict=True)])
+    ]
     nx = sizes[1]
     for k, given in enumerate(arguments):
         blocks = [np.asarray(ca.DM(v)) for v in function.jacobian().call([*given, function.call(given)[0]])]
-        for value, block, width, identity in ((together[0], blocks[1], nx, np.eye(nx)), (together[1], blocks[4], sizes[4], 0.0)):
+        for value, block, width, identity in (
+            (together[0], blocks[1], nx, np.eye(nx)),
+            (together[1], blocks[4], sizes[4], 0.0),
+        ):
             expected = np.zeros((nx, 3 * width))
             expected[:, k * width : (k + 1) * width] = 0.01 * block + identity
             error = np.abs(value[k * nx : (k + 1) * nx] - expected)
@@ -407,6 +413,6 @@ def same_when_mapped(name: str, function: ca.Function, points: Sequence[Point], 
             if wrong.any():
                 row = rows[int(np.argwhere(wrong)[0, 0])]
                 raise FmuDerivativeError(
-                    f"{name}: CasADi's derivative of {row!r} changes when stages are evaluated together, so an estimator "
-                    "would go wrong; this is a defect of this CasADi version: use another"
+                    f"{name}: CasADi's derivative of {row!r} changes when stages are evaluated together, so an "
+                    "estimator would go wrong; this is a defect of this CasADi version: use another"
                 )

@@ -19,7 +19,9 @@ VERSION = 1  # of fmu.h
 CALLS = ("set time", "set states", "set values", "get derivatives", "get values", "directional", "step", "other")
 
 _text, _int, _double, _pointer = ctypes.c_char_p, ctypes.c_int, ctypes.c_double, ctypes.c_void_p
-_references, _doubles, _ints, _flags = (ctypes.POINTER(kind) for kind in (ctypes.c_uint32, _double, _int, ctypes.c_uint8))
+_references, _doubles, _ints, _flags = (
+    ctypes.POINTER(kind) for kind in (ctypes.c_uint32, _double, _int, ctypes.c_uint8)
+)
 
 
 class Configuration(ctypes.Structure):
@@ -43,12 +45,13 @@ def configuration(values: dict[str, Any]) -> Configuration:
     """Return the structure of what `values` says; it keeps its arrays alive."""
     made = Configuration()
     kept: list[Any] = []
-    for name, kind in Configuration._fields_:
+    fields: Any = Configuration._fields_
+    for name, kind in fields:
         value = values[name]
         if kind is _text:
             value = os.fsencode(value)
         elif kind not in (_int, _double):
-            value = (kind._type_ * max(len(value), 1))(*value)  # pyright: ignore
+            value = (kind._type_ * max(len(value), 1))(*value)
             kept.append(value)
             value = ctypes.cast(value, kind)
         setattr(made, name, value)
@@ -130,7 +133,8 @@ def main() -> None:
     request = receive(0)
     try:
         library = load(request["evaluator"])
-        model = opened(library, configuration(request["configuration"]))
+        made = configuration(request["configuration"])  # which the evaluator points to
+        model = opened(library, made)
         values, event = start_values(library, model, request["references"])
     except OSError as error:
         send(out, {"failed": str(error)})

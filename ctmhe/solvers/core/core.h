@@ -17,7 +17,7 @@
 extern "C" {
 #endif
 
-#define CTMHE_CORE_VERSION 6
+#define CTMHE_CORE_VERSION 7
 #define CTMHE_BATCH 8          /* slots that a tape is run for at once */
 #define CTMHE_MAX_ARGUMENTS 64 /* pointers a compiled stage function may use (CasADi's sz_arg, sz_res) */
 
@@ -41,6 +41,13 @@ typedef struct {              /* arguments and results of one step, in that orde
 /* The same for up to CTMHE_BATCH steps at once: what tape.py writes for models of scalar expressions. */
 typedef int (*ctmhe_batch)(const ctmhe_call *calls, int lanes);
 
+/* A model that evaluates itself (an FMU): dx (nx), or the state one step later; y (ny); J (nx + ny rows; columns x, w, p;
+ * column-major). Any of them may be NULL; the rows of J of what is not asked for are left alone. Nonzero on failure. */
+typedef int (*ctmhe_evaluate)(void *model, double t, const double *x, const double *u, const double *w, const double *p,
+                              double *dx, double *y, double *J);
+
+enum ctmhe_method { CTMHE_STEP_MAP = 0, CTMHE_RK4 = 1 };
+
 typedef struct {
   int32_t operation, target, left, right; /* see tape.h */
 } ctmhe_instruction;
@@ -55,6 +62,10 @@ typedef struct {
   double *registers;          /* CTMHE_BATCH each, aligned to 64 bytes */
   int tape_length;
   int sizes[3];               /* of results with elements that the tape leaves out: they are zero */
+  ctmhe_evaluate evaluate;    /* else a model that evaluates itself, and how it is integrated, or NULL */
+  void *model;
+  double *work;               /* (nx (4 + 3 n) + ny + (nx + ny) n), n = nx + nw + np */
+  int method;                 /* of ctmhe_method */
   ctmhe_buffer_eval eval;     /* else the VM's buffer */
   void *self;
   const int *failed;          /* set by the VM's wrapper when an evaluation failed; may be NULL */

@@ -3,7 +3,7 @@
 #ifndef CTMHE_SLOT_H
 #define CTMHE_SLOT_H
 
-#include "layout.h"
+#include "own.h"
 
 /* Evaluate a function of one step for some slots at once. Returns nonzero on failure. */
 static int call_step(const ctmhe_stage *s, const ctmhe_function *f, const call *calls, int lanes, int results) {
@@ -17,6 +17,11 @@ static int call_step(const ctmhe_stage *s, const ctmhe_function *f, const call *
       memcpy(taken, calls[l].res, sizeof(double *) * (size_t)results);
       if (f->function(given, taken, f->iw, f->w, 0)) return 1;
     }
+    return 0;
+  }
+  if (f->evaluate) {
+    for (int l = 0; l < lanes; l++)
+      if (own_step(s, f, calls + l, results == 3)) return 1;
     return 0;
   }
   const int nx = NX(s), nw = NW(s), np = NP(s), nu = s->nu, outputs = POINTS(s) * NY(s), n0 = nx + nw + np;

@@ -223,7 +223,8 @@ static int all_finite(const double *values, int n) {
 }
 
 static int values_at(fmu *m, double t, const double *x, const double *v, const double *p, double *dx, double *y) {
-  if (settle(m, t, x, v, p) || read_values(m, x, dx, y)) return 1;
+  const int asks = dx || m->outputs; /* else y is made of states */
+  if ((asks && settle(m, t, x, v, p)) || read_values(m, x, dx, y)) return 1;
   if ((dx && !all_finite(dx, m->c->nx)) || (y && !all_finite(y, m->c->ny))) {
     m->failed = "a value, which is not finite,", m->failed_status = FMI_DISCARD;
     return 1;
@@ -275,9 +276,9 @@ static int column(fmu *m, int group, int j, int want_dx, int want_y, double *D) 
     const size_t n = (size_t)((want_dx ? nx : 0) + (want_y ? m->outputs : 0));
     const uint32_t *unknown = m->unknown + (want_dx ? 0 : nx), *known = references[group] + j;
     double *into = want_dx ? m->taken : m->taken + nx;
-    if (renewed(m) || (!m->placed && settle(m, m->t, m->x, m->v, m->p))) return 1;
-    m->placed = 1;
-    if (n == 0) {
+    if (n && (renewed(m) || (!m->placed && settle(m, m->t, m->x, m->v, m->p)))) return 1;
+    m->placed |= n > 0;
+    if (n == 0) { /* all y are states */
     } else if (c->version == 2) {
       if (CALL(DIRECTIONAL, "fmi2GetDirectionalDerivative", directional2(m->fmu, unknown, n, known, 1, &one, into)))
         return 1;
@@ -424,7 +425,7 @@ API int ctmhe_fmu_evaluate(void *model, double t, const double *x, const double 
   place(m, t, x, u, w, p);
   if (renewed(m)) return failed(m);
   if (values_at(m, t, m->x, m->v, m->p, dx, y)) return failed(m);
-  m->placed = !c->co_simulation;
+  m->placed = !c->co_simulation && (dx || m->outputs);
   for (int i = 0; i < c->nw; i++) {
     if (dx && c->w_state[i] >= 0) dx[c->w_state[i]] += w[i];
     if (y && c->w_output[i] >= 0) y[c->w_output[i]] += w[i];
@@ -443,27 +444,6 @@ API int ctmhe_fmu_evaluate(void *model, double t, const double *x, const double 
       return failed(m);
   for (int j = 0; j < c->np; j++)
     if (column(m, PARAMETER, j, dx != NULL, y != NULL, J + (nx + c->nw + j) * rows)) return failed(m);
-  return 0;
-}
-
-API int ctmhe_fmu_derivatives(void *model, double t, const double *x, const double *u, const double *w,
-                              const double *p, double *Jt, double *Jx, double *Ju, double *Jp) {
-  fmu *m = model;
-  const ctmhe_fmu_configuration *c = m->c;
-  const int rows = c->nx + c->ny;
-  place(m, t, x, u, w, p);
-  if (renewed(m)) return failed(m);
-  for (int j = 0; Jx && j < c->nx; j++)
-    if (column(m, STATE, j, 1, 1, Jx + j * rows)) return failed(m);
-  for (int j = 0; Ju && j < c->inputs; j++)
-    if (c->input_u[j] >= 0 && column(m, INPUT, j, 1, 1, Ju + c->input_u[j] * rows)) return failed(m);
-  for (int j = 0; Jp && j < c->np; j++)
-    if (column(m, PARAMETER, j, 1, 1, Jp + j * rows)) return failed(m);
-  if (Jt) {
-    memset(Jt, 0, (size_t)rows * sizeof *Jt);
-    if (!c->co_simulation && difference(m, &m->t, 1.0, 1, 1, Jt)) return failed(m);
-  }
-  m->placed = 0;
   return 0;
 }
 

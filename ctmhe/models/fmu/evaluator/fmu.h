@@ -42,10 +42,6 @@ void ctmhe_fmu_close(void *model);
 int ctmhe_fmu_evaluate(void *model, double t, const double *x, const double *u, const double *w, const double *p,
                        double *dx, double *y, double *J);
 
-/* The same derivatives by t, x, u, p: (nx + ny) rows, column-major; any of them may be NULL. */
-int ctmhe_fmu_derivatives(void *model, double t, const double *x, const double *u, const double *w, const double *p,
-                          double *Jt, double *Jx, double *Ju, double *Jp);
-
 /* Values of real variables now, and the time of the first time event (HUGE_VAL: none). */
 int ctmhe_fmu_get(void *model, const uint32_t *references, size_t n, double *values);
 double ctmhe_fmu_next_event(void *model);
