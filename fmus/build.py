@@ -146,11 +146,11 @@ def _pack(name: str, fmi: int, files: dict[str, str], compiler: Compiler, folder
     try:
         run = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     except OSError as error:
-        raise FmuError(f"the C compiler '{compiler.command[0]}' could not be run: {error}; set CC to another") from error
-    if run.returncode != 0:
         raise FmuError(
-            f"the C compiler failed on {name} (FMI {fmi}); try another through CC. {compiler.identity} says:\n{run.stderr}"
-        )
+            f"the C compiler '{compiler.command[0]}' could not be run: {error}; set CC to another"
+        ) from error
+    if run.returncode != 0:
+        raise FmuError(f"the C compiler failed on {name} (FMI {fmi}); try another through CC. It says:\n{run.stderr}")
     archive = folder / "made.fmu"
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as target:
         for path in ("modelDescription.xml", library, *sorted(set(files) - {"modelDescription.xml"})):

@@ -144,8 +144,24 @@ BUILDING = Description(
     "building",
     "Building of two zones with one outer wall each, heated by radiators and the sun",
     states=(
-        Variable("T1", "K", 293.15, 300.0, _ZONE + "1", ("T1", "T2", "Tw1", "heat1", "solar", "R_zw", "R_zz", "C_z", "A1"), 1e-3),
-        Variable("T2", "K", 291.15, 300.0, _ZONE + "2", ("T1", "T2", "Tw2", "heat2", "solar", "R_zw", "R_zz", "C_z", "A2"), 1e-3),
+        Variable(
+            "T1",
+            "K",
+            293.15,
+            300.0,
+            _ZONE + "1",
+            ("T1", "T2", "Tw1", "heat1", "solar", "R_zw", "R_zz", "C_z", "A1"),
+            1e-3,
+        ),
+        Variable(
+            "T2",
+            "K",
+            291.15,
+            300.0,
+            _ZONE + "2",
+            ("T1", "T2", "Tw2", "heat2", "solar", "R_zw", "R_zz", "C_z", "A2"),
+            1e-3,
+        ),
         Variable("Tw1", "K", 288.15, 300.0, _WALL + "1", ("T1", "Tw1", "T_out", "R_zw", "R_wo", "C_w"), 1e-4),
         Variable("Tw2", "K", 287.15, 300.0, _WALL + "2", ("T2", "Tw2", "T_out", "R_zw", "R_wo", "C_w"), 1e-4),
     ),
@@ -216,9 +232,7 @@ BOUNCING_BALL = Description(
 SWITCHED_HEATER = Description(
     "switched_heater",
     "Heated body in a cold room whose heater toggles at each multiple of `period`: time events",
-    states=(
-        Variable("T", "K", 293.15, 300.0, "temperature", ("T", "T_room", "power", "R", "C"), 1e-2),
-    ),
+    states=(Variable("T", "K", 293.15, 300.0, "temperature", ("T", "T_room", "power", "R", "C"), 1e-2),),
     inputs=(Variable("T_room", "K", 293.15, 300.0, "temperature of the room"),),
     parameters=(
         Variable("power", "W", 500.0, 500.0, "heating power while the heater is on"),

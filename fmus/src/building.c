@@ -6,8 +6,8 @@
  *     C_w dTw2/dt = (T2 - Tw2) / R_zw + (T_out - Tw2) / R_wo
  *     y_T1 = T1,  y_T2 = T2,  loss = (Tw1 - T_out) / R_wo + (Tw2 - T_out) / R_wo
  *
- * With the start values of the parameters a zone follows its wall within an hour, and the whole cools down to the
- * outdoors, or warms up by 0.025 K a watt in either zone, with a time constant of three days.
+ * With the start values of the parameters a zone follows its wall within 0.7 to 1.3 hours, and the whole cools down to
+ * the outdoors with a time constant of 2.6 days. A watt in each zone makes both warmer by R_zw + R_wo = 0.025 K.
  */
 #include "model.h"
 
