@@ -32,4 +32,4 @@ def opened(unzipped):
 
     yield make
     for instance in instances:
-        instance.fmu.freeInstance()
+        instance.close()

@@ -55,6 +55,12 @@ class Opened:
         if self.kind == "ModelExchange" or mode.get("event_mode_used"):
             self.event()
 
+    def close(self):
+        """Free the instance and its library; safe to call twice."""
+        if self.fmu is not None:
+            self.fmu.freeInstance()
+            self.fmu = None
+
     def event(self):
         """One round of the event iteration: (states changed, time of the next event or None)."""
         update = self.fmu.newDiscreteStates if self.fmi == 2 else self.fmu.updateDiscreteStates
