@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from ctmhe.models.library import chua
 from fmus.models import MODELS
 from tests.fmus.equations import RHS, everything, oscillator, output, partial, point, scales
 
@@ -35,6 +36,20 @@ def test_derivatives_and_outputs_equal_the_equations(opened, name, fmi, kind):
         instance.set_point(x, u, p)
         np.testing.assert_allclose(instance.get("dx"), RHS[name](x, u, p), rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(instance.get("y"), output(name, x, u, p), rtol=1e-12)
+
+
+@pytest.mark.parametrize("fmi", [2, 3])
+def test_the_circuit_is_that_of_the_library(opened, fmi):
+    """The FMU of Chua's circuit has the derivatives and the start values of parameters of the Python model."""
+    names = [v.name for v in MODELS["chua"].parameters]
+    model, instance = chua(parameters=names, noise=False), opened("chua", fmi)
+    assert list(model.p.names) == names
+    np.testing.assert_array_equal(instance.get("p"), model.p_start)
+    x, _, p = point("chua")
+    d = np.array([0.1, -0.05, 0.02])
+    instance.set_point(x, d, p)
+    expected = np.asarray(model.dynamics(0.0, x, (), d, p)).ravel()
+    np.testing.assert_allclose(instance.get("dx"), expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -301,7 +301,7 @@ def test_single_instance_refuses_a_second(unzipped, opened, fmi):
         assert root.find(kind).get("canBeInstantiatedOnlyOncePerProcess") == "true"
     first = opened("single_instance", fmi)
     for kind in ("ModelExchange", "CoSimulation"):
-        with pytest.raises(Exception, match="[Ii]nstantiate"):
+        with pytest.raises(Exception, match=r"[Ii]nstantiate"):
             opened("single_instance", fmi, kind)
     first.set_states(X)  # the first goes on
     first.derivatives()
@@ -335,7 +335,7 @@ def test_co_simulation_only_cannot_be_instantiated_for_model_exchange(unzipped, 
     model = getattr(module, f"FMU{fmi}Model")(
         guid=about.guid, modelIdentifier=about.coSimulation.modelIdentifier, unzipDirectory=folder
     )
-    with pytest.raises(Exception, match="[Ii]nstantiate"):
+    with pytest.raises(Exception, match=r"[Ii]nstantiate"):
         model.instantiate()
     model.freeLibrary()
 
