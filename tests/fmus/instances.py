@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import ctypes
 import zipfile
+from pathlib import Path
+from xml.etree import ElementTree
 
 import fmpy
 import numpy as np
+import pytest
+from fmpy.fmi1 import FMICallException
 from fmpy.simulation import instantiate_fmu
 
 from fmus.build import build
@@ -20,6 +24,21 @@ def unzip(name, fmi, folder):
     return str(folder)
 
 
+def description(folder):
+    """Root of the model description in an unpacked FMU."""
+    return ElementTree.parse(Path(folder) / "modelDescription.xml").getroot()
+
+
+DISCARD, ERROR = 2, 3  # status of a call, in both versions
+
+
+def fails_with(status, call, *arguments):
+    """Assert that a call fails with this status."""
+    with pytest.raises(FMICallException) as caught:
+        call(*arguments)
+    assert caught.value.status == status
+
+
 class Opened:
     """An initialized instance; the groups x, dx, u, p, y, z, q are lists of value references.
 
@@ -28,16 +47,16 @@ class Opened:
     """
 
     def __init__(self, folder, name, fmi, kind=None, start=None, configuration=None, **mode):
-        description = fmpy.read_model_description(folder)
+        about = fmpy.read_model_description(folder)
         self.model, self.fmi, self.kind = MODELS[name], fmi, kind or MODELS[name].kinds[0]
-        self.reference = {v.name: v.valueReference for v in description.modelVariables}
+        self.reference = {v.name: v.valueReference for v in about.modelVariables}
         model = self.model
         groups = {"x": model.states, "u": model.inputs, "p": model.parameters, "y": model.outputs}
         groups |= {"z": model.indicators, "q": model.discretes}
         self.vr = {key: [self.reference[v.name] for v in group] for key, group in groups.items()}
         self.vr["dx"] = [self.reference[f"der({v.name})"] for v in model.states]
         self.size = {key: sum(v.size for v in group) for key, group in groups.items()} | {"dx": len(model.states)}
-        self.fmu = instantiate_fmu(folder, description, fmi_type=self.kind, **mode)
+        self.fmu = instantiate_fmu(folder, about, fmi_type=self.kind, **mode)
         self.get_values = self.fmu.getReal if fmi == 2 else self.fmu.getFloat64
         self.set_values = self.fmu.setReal if fmi == 2 else self.fmu.setFloat64
         for key, value in (configuration or {}).items():
