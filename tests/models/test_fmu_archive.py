@@ -202,7 +202,7 @@ def test_an_unreadable_file_is_refused(fmu, tmp_path, monkeypatch):
 def test_a_full_disk_is_told_and_leaves_nothing(fmu, private, monkeypatch):
     """What the system says when the private folder cannot be written becomes the error."""
 
-    def refuse(path, *arguments, **keywords):
+    def refuse(*arguments, **keywords):
         raise OSError(28, "No space left on device")
 
     for owner, name in ((Path, "mkdir"), (tempfile, "mkdtemp")):
