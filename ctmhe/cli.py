@@ -130,11 +130,12 @@ def reproduce(
 
 
 def main() -> None:
-    """Run the command line; an error of this library is one readable paragraph and exit code 1."""
+    """Run the command line; an error of this library is a readable text and exit code 1."""
     try:
         app()
     except CtmheError as error:
-        typer.echo(textwrap.fill(f"ctmhe: {error}", 100, break_long_words=False), err=True)
+        lines = f"ctmhe: {error}".splitlines()  # a compiler's words keep their lines
+        typer.echo("\n".join(textwrap.fill(line, 100, break_long_words=False) for line in lines), err=True)
         raise SystemExit(1) from None
 
 

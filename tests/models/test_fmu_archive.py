@@ -9,6 +9,7 @@ import sys
 import tempfile
 import warnings
 import zipfile
+import zlib
 from pathlib import Path
 
 import pytest
@@ -117,6 +118,25 @@ def test_a_null_character_in_a_name_is_refused(fmu, tmp_path):
         Unpacked(file)
 
 
+def test_a_second_name_in_an_extra_field_cannot_leave_the_folder(fmu, tmp_path, private):
+    """Info-ZIP's Unicode path replaces the name that everybody sees; it is judged too, where Python heeds it."""
+    for number, second in enumerate((b"../../evil.txt", b"modelDescription.xml", b"/evil.txt")):
+        entry = zipfile.ZipInfo("resources/good.txt")
+        field = b"\x01" + zlib.crc32(b"resources/good.txt").to_bytes(4, "little") + second
+        entry.extra = (0x7075).to_bytes(2, "little") + len(field).to_bytes(2, "little") + field
+        file = with_entries(fmu, tmp_path / f"{number}.fmu", (entry, b"evil"))
+        with zipfile.ZipFile(file) as archive:
+            heeded = archive.infolist()[-1].filename != "resources/good.txt"
+        if heeded:
+            with pytest.raises(FmuArchiveError, match="refused"):
+                Unpacked(file)
+        else:
+            Unpacked(file).close()
+        assert [path.name for path in private.parent.rglob("*")] == ["private"]
+        entry.filename = second.decode()  # as a Python that heeds it reads the archive
+        assert (archive_module._reason(entry) is None) == (second == b"modelDescription.xml")
+
+
 @pytest.mark.parametrize(
     ("cap", "value", "message"),
     [
@@ -182,12 +202,14 @@ def test_an_unreadable_file_is_refused(fmu, tmp_path, monkeypatch):
 def test_a_full_disk_is_told_and_leaves_nothing(fmu, private, monkeypatch):
     """What the system says when the private folder cannot be written becomes the error."""
 
-    def refuse(path, *arguments, **keywords):
+    def refuse(*arguments, **keywords):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "mkdir", refuse)
-    with pytest.raises(FmuArchiveError, match="No space left"):
-        Unpacked(fmu)
+    for owner, name in ((Path, "mkdir"), (tempfile, "mkdtemp")):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, refuse)
+            with pytest.raises(FmuArchiveError, match="No space left"):
+                Unpacked(fmu)
     assert list(private.iterdir()) == []
 
 

@@ -72,7 +72,10 @@ class Unpacked:
 
     def __init__(self, path: str | Path):
         self.path = _absolute(path)
-        private = Path(tempfile.mkdtemp(prefix="ctmhe-fmu-")).resolve()  # mode 0700
+        try:
+            private = Path(tempfile.mkdtemp(prefix="ctmhe-fmu-")).resolve()  # mode 0700
+        except OSError as error:
+            raise FmuArchiveError(f"{self.path.name} needs a temporary folder: {error}; set TMPDIR") from error
         self._remove = weakref.finalize(self, _remove, private, os.getpid())
         self.folder = private / "fmu"
         try:
@@ -214,21 +217,25 @@ def _places(name: str, entries: list[zipfile.ZipInfo], size: int) -> dict[zipfil
 
 def _reason(entry: zipfile.ZipInfo) -> str | None:
     """Return why an entry is refused whatever else there is, or None."""
-    name = entry.orig_filename
     kind = stat.S_IFMT(entry.external_attr >> 16)
     reasons = {
-        "it is absolute": name.startswith("/"),
-        "it contains a colon": ":" in name,  # C:/x, and streams of NTFS
-        "it contains '..'": ".." in name.split("/"),
-        "it contains a backslash": "\\" in name,
-        "it contains a null character": "\0" in name,
-        "it contains a control character": any(unicodedata.category(c) in {"Cc", "Cs"} for c in name),
-        "its name is too long": len(name) > MAX_PATH
-        or any(len(part.encode("utf-8", "replace")) > MAX_NAME for part in name.split("/")),
         "it is a link or device": kind not in {0, stat.S_IFREG, stat.S_IFDIR},
         "it is encrypted": bool(entry.flag_bits & ENCRYPTED),
         f"its compression (method {entry.compress_type}) is none that FMI allows": entry.compress_type not in METHODS,
     }
+    for name in (entry.orig_filename, entry.filename):  # an extra field may hold a second name, which then counts
+        reasons |= {
+            "it is absolute": name.startswith("/"),
+            "it contains a colon": ":" in name,  # C:/x, and streams of NTFS
+            "it contains '..'": ".." in name.split("/"),
+            "it contains a backslash": "\\" in name,
+            "it contains a null character": "\0" in name,
+            "it contains a control character": any(unicodedata.category(c) in {"Cc", "Cs"} for c in name),
+            "its name is too long": len(name) > MAX_PATH
+            or any(len(part.encode("utf-8", "replace")) > MAX_NAME for part in name.split("/")),
+        }
+        if any(reasons.values()):
+            break
     return next((reason for reason, met in reasons.items() if met), None)
 
 

@@ -27,7 +27,7 @@ from ctmhe.models.fmu.units import BASE, Unit
 
 log = logging.getLogger(__name__)
 
-INITIALS = {"exact", "approx", "calculated", ""}
+INITIALS = {"exact", "approx", "calculated"}
 MAX_INDICATORS = 1_000_000  # FMI 2 states a number that nothing else in the file confirms
 
 
@@ -165,7 +165,9 @@ def _reals(root: Element, major: int, raws: Sequence[Raw]) -> tuple[dict[str, Va
             if name in names:
                 raise FmuArchiveError(f"modelDescription.xml: two variables are named {name[:100]!r}; export it again")
             names.add(name)
-            if variable is not None:
+            if variable is not None and name == raw.name:
+                variables[name] = variable
+            elif variable is not None:
                 variables[name] = replace(variable, name=name, description=text or variable.description)
     return variables, own
 
@@ -213,7 +215,7 @@ def _variable(raw: Raw, declared: Reader | None) -> Variable:
         reference=raw.reference,
         causality=raw.causality,
         variability=raw.variability,
-        initial=raw.reader.word("initial", INITIALS, "") or None,
+        initial=_initial(raw),
         unit=raw.value.text("unit") or (declared.text("unit") if declared is not None else ""),
         nominal=1.0 if nominal is None else nominal,
         start=raw.value.number("start"),
@@ -221,6 +223,14 @@ def _variable(raw: Raw, declared: Reader | None) -> Variable:
         maximum=maximum,
         description=raw.reader.text("description"),
     )
+
+
+def _initial(raw: Raw) -> str | None:
+    """Return `initial`, or what the standards take where it is not given: nothing for inputs and time."""
+    if raw.reader.element.get("initial") is None and raw.causality in {"input", "independent"}:
+        return None
+    given = raw.causality == "parameter" or raw.variability == "constant"
+    return raw.reader.word("initial", INITIALS, "exact" if given else "calculated")
 
 
 def _units(root: Element) -> dict[str, Unit]:

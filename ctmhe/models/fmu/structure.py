@@ -28,8 +28,13 @@ STRUCTURE = {
     },
 }
 PARAMETERS = {"parameter", "calculatedParameter", "structuralParameter"}
-CAUSALITIES = PARAMETERS | {"input", "output", "local", "independent"}
 VARIABILITIES = {"constant", "fixed", "tunable", "discrete", "continuous"}
+LEGAL = {key: {"fixed", "tunable"} for key in PARAMETERS} | {  # causality -> variabilities
+    "input": {"discrete", "continuous"},
+    "output": {"constant", "discrete", "continuous"},
+    "local": VARIABILITIES,
+    "independent": {"continuous"},
+}
 
 
 @dataclass(frozen=True)
@@ -93,16 +98,18 @@ def _raw(element: Element, major: int) -> Raw:
         raise FmuArchiveError(
             f"modelDescription.xml: {reader.owner} has no type that FMI {major} knows; export it again"
         )
-    causality = reader.word("causality", CAUSALITIES, "local")
-    usual = "fixed" if causality in PARAMETERS else "continuous"
+    causality = reader.word("causality", LEGAL, "local")
+    variability = reader.word("variability", VARIABILITIES, "fixed" if causality in PARAMETERS else "continuous")
+    if variability not in LEGAL[causality]:
+        raise reader.fail("variability", f"which a variable of causality {causality} cannot have")
     return Raw(
         reader,
-        replace(reader, element=types[0]),
+        Reader(types[0], reader.owner),
         name,
         reader.reference("valueReference"),
         types[0].tag,
         causality,
-        reader.word("variability", VARIABILITIES, usual),
+        variability,
         major == 3 and element.find("Dimension") is not None,
     )
 
