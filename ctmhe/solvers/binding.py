@@ -35,7 +35,7 @@ class Function(ctypes.Structure):
     _fields_ = [
         *((name, _pointer) for name in ("batch", "function", "iw", "w", "tape", "constants", "registers")),
         ("tape_length", _int), ("sizes", _int * 3),
-        ("evaluate", _pointer), ("model", _pointer), ("work", _pointer), ("method", _int),
+        ("evaluate", _pointer), ("model", _pointer), ("work", _pointer), ("input", _pointer), ("method", _int),
         ("eval", _pointer), ("self", _pointer), ("failed", _pointer),
         ("arg", _pointer * 9), ("res", _pointer * 3),
     ]  # fmt: skip
@@ -155,15 +155,12 @@ class Functions:
 
     def _own(self, stage: StageFunction) -> Function:
         evaluator = stage.model.evaluator()  # pyright: ignore
-        nx, n = stage.nx, stage.nx + stage.nw + stage.np
-        work = np.zeros(4 * nx + stage.ny + (4 * nx + stage.ny) * n)
-        self.kept += [evaluator, work]
-        return Function(
-            evaluate=evaluator.address,
-            model=evaluator.pointer,
-            work=work.ctypes.data,
-            method=METHODS[stage.method or ""],
-        )
+        nx, ny, n = stage.nx, stage.ny, stage.nx + stage.nw + stage.np
+        work = np.zeros(3 * nx + 4 * (nx + ny) * n + nx * (nx + ny + 1))  # see core/own.h
+        u = np.zeros(stage.nu + 1)
+        self.kept += [evaluator, work, u]
+        addresses = {"work": work.ctypes.data, "input": u.ctypes.data, "method": METHODS[stage.method or ""]}
+        return Function(evaluate=evaluator.address, model=evaluator.pointer, **addresses)
 
     def _compiled(self, core: ctypes.CDLL, name: str) -> Function:
         sizes = (ctypes.c_longlong * 4)()

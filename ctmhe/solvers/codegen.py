@@ -61,9 +61,9 @@ def specialised_core(stage: StageFunction, p_estimated: bool) -> Path | None:
     -------
     Path or None
         None, with a logged reason, when there is no compiler, compiling fails, or the stage function is more than
-        plain C: CVODES, FMUs, callbacks.
+        plain C: CVODES, callbacks. For a model that evaluates itself (an FMU) it is the core alone, with its sizes.
     """
-    functions = {"value": stage.value, "jacobian": stage.derivative}
+    functions = {} if stage.method is not None else {"value": stage.value, "jacobian": stage.derivative}
     if stage.symbolic:
         functions["curvature"] = stage.mapped[2][1]
     taped = stage.symbolic and stage.derivative.n_instructions() > LARGE
@@ -89,7 +89,7 @@ def specialised_core(stage: StageFunction, p_estimated: bool) -> Path | None:
     def sources() -> list[Source]:
         if taped:
             return [Source("core.c", (CORE / "core.c").read_text(), flags)]
-        taken = {key: tape_of(functions[key]) for key in ("value", "jacobian")}
+        taken = {key: tape_of(function) for key, function in functions.items() if key != "curvature"}
         tapes = {key: tape for key, tape in taken.items() if tape is not None}
         rest = {key: function for key, function in functions.items() if key not in tapes}
         return [*_batches(tapes), *_generate(rest), Source("core.c", (CORE / "core.c").read_text(), flags)]

@@ -203,10 +203,10 @@ class Evaluator:
         new, self._seen = failures - self._seen, failures
         return new
 
-    def repeat(self, calls: dict[str, int]) -> None:
-        """Make FMI calls and nothing else, for measurements."""
+    def repeat(self, x: Array, calls: dict[str, int]) -> None:
+        """Make FMI calls at x (nx,) and nothing else, for measurements."""
         counts = (ctypes.c_int64 * len(worker.CALLS))(*(calls.get(kind, 0) for kind in worker.CALLS))
-        if self._library.ctmhe_fmu_repeat(self.pointer, counts):
+        if self._library.ctmhe_fmu_repeat(self.pointer, np.array(x, dtype=float).ctypes.data, counts):
             raise FloatingPointError("a repeated FMI call failed")
 
     def close(self) -> None:

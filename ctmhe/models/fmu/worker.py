@@ -70,7 +70,7 @@ def load(path: str) -> ctypes.CDLL:
         "next_event": ([_pointer], _double),
         "counts": ([_pointer] * 4, None),
         "message": ([_pointer], _text),
-        "repeat": ([_pointer, _pointer], _int),
+        "repeat": ([_pointer, _pointer, _pointer], _int),
         "serve": ([_pointer, _int, _int], _int),
         "remote": ([*[_int] * 7, _double, _pointer], _pointer),
         "version": ([], _int),

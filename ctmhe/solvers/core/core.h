@@ -64,7 +64,7 @@ typedef struct {
   int sizes[3];               /* of results with elements that the tape leaves out: they are zero */
   ctmhe_evaluate evaluate;    /* else a model that evaluates itself, and how it is integrated, or NULL */
   void *model;
-  double *work;               /* (nx (4 + 3 n) + ny + (nx + ny) n), n = nx + nw + np */
+  double *work, *input;       /* its memory: see own.h; (nu) */
   int method;                 /* of ctmhe_method */
   ctmhe_buffer_eval eval;     /* else the VM's buffer */
   void *self;

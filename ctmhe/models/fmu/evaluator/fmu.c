@@ -29,10 +29,12 @@ typedef struct {
   uint32_t *unknown;              /* dx, then those outputs */
   int *row;                       /* of the outputs: index of y */
   int dx_differenced, y_differenced; /* any row of them */
-  double *memory, *v, *x, *p, *set_v, *set_p, *taken, *high, *low;
-  double set_t;
+  double *memory, *v, *set_v, *set_p, *taken, *high, *low;
+  double set_t, *own_x, *own_p;   /* room for points that are moved */
   int known_t, known_v, known_p, placed; /* what the instance has been told is what set_* say; it is at the point */
   double t;                       /* the point: t, x, v, p */
+  const double *x, *p;
+  int straight;                   /* unknowns are the rows, in order, and nothing is differenced */
   int64_t calls[CALLS], failures, instances;
   const char *failed;             /* the call that failed */
   int failed_status;
@@ -61,7 +63,7 @@ static void listen3(void *environment, int status, const char *category, const c
   if (m && text && status != FMI_OK) snprintf(m->told, sizeof m->told, "%s", text);
 }
 
-static int noted(fmu *m, int kind, const char *name, int status) {
+static inline int noted(fmu *m, int kind, const char *name, int status) {
   m->calls[kind]++;
   if (status == FMI_OK || status == FMI_WARNING) return 0;
   if (status >= FMI_ERROR) m->broken = status;
@@ -236,7 +238,8 @@ static int values_at(fmu *m, double t, const double *x, const double *v, const d
 
 static int renewed(fmu *m) { return m->broken && instantiate(m); }
 
-/* Rows of dx and y (from nx on) at the point, moved by `step` along one coordinate; the result of a failure is 1. */
+/* Rows of dx and y (from nx on) at the point, moved by `step` along one coordinate, which is the evaluator's own copy;
+ * the result of a failure is 1. */
 static int moved(fmu *m, double *coordinate, double step, int want_dx, int want_y, double *values) {
   const double kept = *coordinate;
   *coordinate = kept + step;
@@ -247,8 +250,12 @@ static int moved(fmu *m, double *coordinate, double step, int want_dx, int want_
 }
 
 /* A central difference; one-sided where the FMU cannot be evaluated on the other side. */
-static int difference(fmu *m, double *coordinate, double size, int want_dx, int want_y, double *D) {
+static int difference(fmu *m, int group, int j, double size, int want_dx, int want_y, double *D) {
   const int nx = m->c->nx, rows = nx + m->c->ny;
+  double *coordinate = (group == STATE ? m->own_x : group == INPUT ? m->v : m->own_p) + j;
+  if (m->x != m->own_x) memcpy(m->own_x, m->x, (size_t)nx * sizeof *m->x);
+  if (m->p != m->own_p && m->c->np) memcpy(m->own_p, m->p, (size_t)m->c->np * sizeof *m->p);
+  m->x = m->own_x, m->p = m->own_p;
   const double step = m->c->reach * (fabs(*coordinate) > size ? fabs(*coordinate) : size);
   int above = !moved(m, coordinate, step, want_dx, want_y, m->high);
   int below = !moved(m, coordinate, -step, want_dx, want_y, m->low);
@@ -266,11 +273,10 @@ static int column(fmu *m, int group, int j, int want_dx, int want_y, double *D) 
   const ctmhe_fmu_configuration *c = m->c;
   const int nx = c->nx, flat = group == STATE ? j : group == INPUT ? nx + j : nx + c->inputs + j;
   const int asked = c->directional && !c->differenced[flat];
-  double *const points[] = {m->x, m->v, m->p};
   const double *const sizes[] = {c->x_size, c->input_size, c->p_size};
   const uint32_t *const references[] = {c->x, c->input, c->p};
   if (!asked || (want_dx && m->dx_differenced) || (want_y && m->y_differenced))
-    if (difference(m, points[group] + j, sizes[group][j], want_dx, want_y, D)) return 1;
+    if (difference(m, group, j, sizes[group][j], want_dx, want_y, D)) return 1;
   if (asked) {
     const double one = 1.0;
     const size_t n = (size_t)((want_dx ? nx : 0) + (want_y ? m->outputs : 0));
@@ -300,11 +306,49 @@ static int column(fmu *m, int group, int j, int want_dx, int want_y, double *D) 
   return 0;
 }
 
+/* Columns of directional derivatives, all rows at once, where nothing has to be rearranged. */
+static int straight(fmu *m, int group, int count, int want_dx, int want_y, double *D) {
+  const ctmhe_fmu_configuration *c = m->c;
+  const int nx = c->nx, rows = nx + c->ny, first = want_dx ? 0 : nx;
+  const uint32_t *known = group == STATE ? c->x : c->p, *unknown = m->unknown + first;
+  const size_t n = (size_t)((want_y ? rows : nx) - first);
+  const double one = 1.0;
+  if (!m->placed && settle(m, m->t, m->x, m->v, m->p)) return 1;
+  m->placed = 1;
+  D += first;
+  if (c->version == 2) {
+    for (int j = 0; j < count; j++, D += rows)
+      if (CALL(DIRECTIONAL, "fmi2GetDirectionalDerivative", directional2(m->fmu, unknown, n, known + j, 1, &one, D)))
+        return 1;
+  } else {
+    for (int j = 0; j < count; j++, D += rows)
+      if (CALL(DIRECTIONAL, "fmi3GetDirectionalDerivative", directional3(m->fmu, unknown, n, known + j, 1, &one, 1, D, n)))
+        return 1;
+  }
+  return 0;
+}
+
+/* Columns of one group; those of states and parameters lie side by side. */
+static int columns(fmu *m, int group, int count, int want_dx, int want_y, double *D) {
+  const int rows = m->c->nx + m->c->ny;
+  if (count == 0) return 0;
+  if (m->straight && (want_dx || m->outputs) && (!want_y || m->outputs == m->c->ny)) {
+    if (straight(m, group, count, want_dx, want_y, D)) return 1;
+    for (int j = 0; j < count; j++)
+      if (!all_finite(D + j * rows + (want_dx ? 0 : m->c->nx), (want_dx ? m->c->nx : 0) + (want_y ? m->c->ny : 0))) {
+        m->failed = "a derivative, which is not finite,", m->failed_status = FMI_DISCARD;
+        return 1;
+      }
+    return 0;
+  }
+  for (int j = 0; j < count; j++)
+    if (column(m, group, j, want_dx, want_y, D + j * rows)) return 1;
+  return 0;
+}
+
 static void place(fmu *m, double t, const double *x, const double *u, const double *w, const double *p) {
   const ctmhe_fmu_configuration *c = m->c;
-  m->t = t;
-  memcpy(m->x, x, (size_t)c->nx * sizeof *x);
-  if (c->np) memcpy(m->p, p, (size_t)c->np * sizeof *p);
+  m->t = t, m->x = x, m->p = p;
   for (int i = 0; i < c->inputs; i++) {
     double value = c->input_u[i] >= 0 ? u[c->input_u[i]] : c->input_base[i];
     if (c->input_w[i] >= 0) value += w[c->input_w[i]];
@@ -378,7 +422,7 @@ API void *ctmhe_fmu_open(const ctmhe_fmu_configuration *c, char *message, size_t
     snprintf(message, size, "out of memory");
     return give_up(m, message, size);
   }
-  m->x = m->memory, m->v = m->x + nx, m->p = m->v + nv, m->set_v = m->p + np, m->set_p = m->set_v + nv;
+  m->own_x = m->memory, m->v = m->own_x + nx, m->own_p = m->v + nv, m->set_v = m->own_p + np, m->set_p = m->set_v + nv;
   m->taken = m->set_p + np, m->high = m->taken + rows, m->low = m->high + rows;
   memcpy(m->unknown, c->dx, nx * sizeof *c->dx);
   for (int i = 0; i < c->ny; i++) {
@@ -388,6 +432,8 @@ API void *ctmhe_fmu_open(const ctmhe_fmu_configuration *c, char *message, size_t
     m->y_differenced |= c->rows_differenced[nx + (size_t)i];
   }
   for (size_t i = 0; i < nx; i++) m->dx_differenced |= c->rows_differenced[i];
+  m->straight = c->directional && !m->dx_differenced && !m->y_differenced;
+  for (int i = 0; i < c->nx + c->inputs + c->np; i++) m->straight &= !c->differenced[i];
   m->next_event = HUGE_VAL;
   m->library = open_library(c->library, message, size);
   if (!m->library) return give_up(m, message, size);
@@ -431,8 +477,7 @@ API int ctmhe_fmu_evaluate(void *model, double t, const double *x, const double 
     if (y && c->w_output[i] >= 0) y[c->w_output[i]] += w[i];
   }
   if (!J) return 0;
-  for (int j = 0; j < nx; j++)
-    if (column(m, STATE, j, dx != NULL, y != NULL, J + j * rows)) return failed(m);
+  if (columns(m, STATE, nx, dx != NULL, y != NULL, J)) return failed(m);
   for (int j = 0; j < c->nw; j++) {
     double *D = J + (nx + j) * rows;
     memset(D, 0, (size_t)rows * sizeof *D);
@@ -442,8 +487,7 @@ API int ctmhe_fmu_evaluate(void *model, double t, const double *x, const double 
   for (int j = 0; j < c->inputs; j++)
     if (c->input_w[j] >= 0 && column(m, INPUT, j, dx != NULL, y != NULL, J + (nx + c->input_w[j]) * rows))
       return failed(m);
-  for (int j = 0; j < c->np; j++)
-    if (column(m, PARAMETER, j, dx != NULL, y != NULL, J + (nx + c->nw + j) * rows)) return failed(m);
+  if (columns(m, PARAMETER, c->np, dx != NULL, y != NULL, J + (nx + c->nw) * rows)) return failed(m);
   return 0;
 }
 
@@ -463,7 +507,7 @@ API void ctmhe_fmu_counts(void *model, int64_t *calls, int64_t *failures, int64_
 
 API const char *ctmhe_fmu_message(void *model) { return ((fmu *)model)->message; }
 
-API int ctmhe_fmu_repeat(void *model, const int64_t *calls) {
+API int ctmhe_fmu_repeat(void *model, const double *x, const int64_t *calls) {
   fmu *m = model;
   const ctmhe_fmu_configuration *c = m->c;
   const double one = 1.0;
@@ -476,7 +520,7 @@ API int ctmhe_fmu_repeat(void *model, const int64_t *calls) {
         const int j = c->nx ? (int)(made[kind] % c->nx) : 0;
         const size_t n = (size_t)(c->nx + m->outputs);
         if (kind == SET_TIME) bad |= m->f.set_time(m->fmu, m->t) > FMI_WARNING;
-        if (kind == SET_STATES) bad |= m->f.set_states(m->fmu, m->x, (size_t)c->nx) > FMI_WARNING;
+        if (kind == SET_STATES) bad |= m->f.set_states(m->fmu, x, (size_t)c->nx) > FMI_WARNING;
         if (kind == SET_VALUES && c->version == 2)
           bad |= m->f.set2(m->fmu, c->input, (size_t)c->inputs, m->v) > FMI_WARNING;
         if (kind == SET_VALUES && c->version == 3)

@@ -50,8 +50,8 @@ double ctmhe_fmu_next_event(void *model);
 void ctmhe_fmu_counts(void *model, int64_t *calls, int64_t *failures, int64_t *instances);
 const char *ctmhe_fmu_message(void *model);
 
-/* Make as many calls of each kind (CALLS), mixed as an evaluation mixes them: what they cost by themselves. */
-int ctmhe_fmu_repeat(void *model, const int64_t *calls);
+/* Make as many calls of each kind (CALLS) at x, mixed as an evaluation mixes them: what they cost by themselves. */
+int ctmhe_fmu_repeat(void *model, const double *x, const int64_t *calls);
 
 /* Answer requests that come through a pipe, until it ends: the inside of a worker process. */
 int ctmhe_fmu_serve(void *model, int in, int out);
