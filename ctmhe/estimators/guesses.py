@@ -24,7 +24,7 @@ def starting_points(stage: StageFunction, state: State, window: Window) -> list[
 
 def shifted_guess(stage: StageFunction, window: Window) -> Guess:
     """Return the prior carried forward without disturbance; held where that leaves the model's domain."""
-    nx, n = stage.nx, len(window.mesh)
+    nx = stage.nx
     x0 = np.clip(window.prior[:nx], window.x_lower[0], window.x_upper[0])
     try:
         guess = rollout(stage, window, x0, window.prior[nx:])
@@ -32,7 +32,12 @@ def shifted_guess(stage: StageFunction, window: Window) -> Guess:
             return guess
     except FloatingPointError:
         pass
-    return Guess.of(np.tile(x0, (n + 1, 1)), np.zeros((n, stage.nw)), window.prior[nx:], stage.ny)
+    return resting_guess(stage, window, x0, window.prior[nx:])
+
+
+def resting_guess(stage: StageFunction, window: Window, x: Array, p: Array) -> Guess:
+    """Return a state (nx,) at which the model could be evaluated once, held over the window."""
+    return Guess.of(np.tile(x, (len(window.mesh) + 1, 1)), np.zeros((len(window.mesh), stage.nw)), p, stage.ny)
 
 
 def warm_start(stage: StageFunction, state: State, window: Window) -> Guess:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,7 @@ import numpy as np
 from ctmhe.data.log import Log
 from ctmhe.data.window import held_inputs
 from ctmhe.errors import InputError, NotEstimated, TooLate
-from ctmhe.estimators.guesses import open_loop, starting_points
+from ctmhe.estimators.guesses import open_loop, resting_guess, starting_points
 from ctmhe.estimators.priors import empty_path, filtering_prior, path_rows, trajectory_at
 from ctmhe.estimators.state import State, load_state, save_state
 from ctmhe.models.continuous import Model
@@ -45,6 +47,8 @@ from ctmhe.types import (
     made,
     positive,
 )
+
+logger = logging.getLogger(__name__)
 
 SOLVERS = ("gauss-newton", "numpy", "ipopt")
 
@@ -207,6 +211,8 @@ class MHE:
             limits["tolerance"] = positive("tolerance", tolerance)
         self._gauss_newton = GaussNewton(self.stage, **limits)
         self._reference = Ipopt(self.stage)
+        # how often a model that is not ours (an FMU) could not be evaluated, and the last time in words
+        self._failures: Callable[[], tuple[int, str]] | None = getattr(model, "failures", None)
         compile = compile or os.environ.get("CTMHE_COMPILE") or "auto"
         if compile not in ("off", "auto"):
             raise InputError(f"compile must be 'off' or 'auto', got {compile!r}")
@@ -371,20 +377,25 @@ class MHE:
                     "smooth(state, t) gives estimates of the past"
                 )
             t = state.t
+        failures = self._failures()[0] if self._failures else 0
         since = state.since if t == state.t else state.t  # a solve repeated with what has arrived takes its own place
         if self._updates is not None:
             logs = (state.measurements, state.inputs, state.path)
             known, times = (state.start, state.p), (state.t, since)
             update = self._updates.run(*self._span(state, t), *logs, state.window, known, times, state.prepared)
             if update is not None:
-                added = (update.path_times, update.path_rows)
-                return self._conclude(state, t, since, update.solved, added, update.cost, update.status, began)
+                added, status = (update.path_times, update.path_rows), self._told(update.status, failures)
+                return self._conclude(state, t, since, update.solved, added, update.cost, status, began)
         window, notes = self._window(state, t)
         guesses = starting_points(self.stage, state, window)
         rungs = (window, self._solver, lambda: self._reference, guesses, notes)
-        solution, status = climb(*rungs, real_time=self._real_time)
+        evaluable = (lambda: self._failures()[0] == failures) if self._failures else (lambda: True)
+        nx = self.stage.nx
+        held = partial(resting_guess, self.stage, window, state.start[:nx], state.start[nx:])
+        solution, status = climb(*rungs, real_time=self._real_time, evaluable=evaluable, rescue=held)
         if solution is None:
             solution = open_loop(self.stage, state, window)
+        status = self._told(status, failures)
         solved = self._packed(window, solution)
         added = path_rows(solved.trajectory, since)
         return self._conclude(state, t, since, solved, added, solution.cost, status, began)
@@ -427,6 +438,16 @@ class MHE:
         logs, known = (measurements, state.inputs, state.path), (state.start, state.p)
         ticket = self._updates.prepare(*self._span(state, t), *logs, state.window, known, (state.t, since))
         return made(State, state.__dict__ | {"prepared": ticket})
+
+    def _told(self, status: Status, before: int) -> Status:
+        """Add to a status what the model could not evaluate since it had failed `before` times."""
+        if self._failures is None:
+            return status
+        count, last = self._failures()
+        if count == before:
+            return status
+        times = "once" if count == before + 1 else f"{count - before} times, last"
+        return replace(status, notes=(*status.notes, f"the model could not be evaluated ({times}: {last})"))
 
     def _span(self, state: State, end: float) -> tuple[tuple[float, float], bool]:
         """Return start and end of the window that ends at `end`, and whether it still grows."""
@@ -502,7 +523,7 @@ class MHE:
         if self.model.step is not None:
             u = solved.part("u1")[-1]
             idle = solved.part("t")[-1] == solved.part("t")[-2]
-            y = frozen(np.asarray(self.model.output(t, x, u, w if idle else self._silent, p)).reshape(-1))
+            y = frozen(self._output(t, x, u, w if idle else self._silent, p))
         edge = t - self.horizon
         slack = 1e-6 * self.interval
         path = state.path if t > state.t else state.path.drop_after(since)
@@ -536,15 +557,19 @@ class MHE:
     def propagate(self, state: State, t0: float, t1: float, x: Array, p: Array) -> Array:
         """Return the state at `t1` from `x` (nx,) at `t0`, without disturbance, under the inputs that `state` knows.
 
-        The last known input is held. For a `DiscreteModel` both times are multiples of its step.
+        The last known input is held. For a `DiscreteModel` both times are multiples of its step. Where the model cannot
+        be evaluated, the state is held.
         """
         if t1 <= t0:
             return x
         records = Records(np.empty(0), np.empty((0, len(self.model.y))), *self._known_inputs(state, t0, t1))
         mesh = self._prediction_mesh(t0, t1, records)
         u0, u1 = self._inputs_on(mesh, records)
-        for k in range(len(mesh)):
-            x, _ = self.stage.step(mesh.t[k], mesh.h[k], x, self._silent, p, u0[k], u1[k])
+        try:
+            for k in range(len(mesh)):
+                x, _ = self.stage.step(mesh.t[k], mesh.h[k], x, self._silent, p, u0[k], u1[k])
+        except FloatingPointError:
+            logger.warning("the prediction from t = %g s to %g s holds the state: the model fails", t0, t1)
         return x
 
     def _prediction_mesh(self, t0: float, t1: float, records: Records) -> Mesh:
@@ -557,13 +582,22 @@ class MHE:
         return held_inputs(records.u_times, records.u, mesh.t, mesh.tolerance, self.assembly.input_linear)
 
     def output(self, state: State, t: float, x: Array, p: Array) -> Array:
-        """Return the undisturbed output (ny,) at `t` for a given state and parameters, under the known input."""
+        """Return the undisturbed output (ny,) at `t` for a given state and parameters, under the known input.
+
+        NaN where the model cannot be evaluated.
+        """
         u = np.empty(0)
         if len(self.model.u):
             times, rows = self._known_inputs(state, t, t)
             u, _ = held_inputs(times, rows, np.array([t, t]), self._slack(t), self.assembly.input_linear)
             u = u[0]
-        return np.asarray(self.model.output(t, x, u, self._silent, p)).reshape(-1)
+        return self._output(t, x, u, self._silent, p)
+
+    def _output(self, t: float, x: Array, u: Array, w: Array, p: Array) -> Array:
+        try:
+            return np.asarray(self.model.output(t, x, u, w, p)).reshape(-1)
+        except RuntimeError:  # an FMU that fails there
+            return np.full(len(self.model.y), np.nan)
 
     def predict(self, state: State, t: float) -> Prediction:
         """Return the open-loop prediction at `t` from the last estimate: no disturbance, the last input held.

@@ -50,8 +50,25 @@ def filtering_prior(stage: StageFunction, path: Log, t: float, tolerance: float)
     if t >= end:
         x = x_end
     elif t > start:
-        x, _ = stage.step(start, t - start, x, w, p, u0, u0 + (u1 - u0) * ((t - start) / (end - start)))
+        x = _inside(stage, t, (start, end), (x, x_end), w, p, (u0, u1))
     return np.concatenate([x, p])
+
+
+def _inside(
+    stage: StageFunction,
+    t: float,
+    span: tuple[float, float],
+    ends: tuple[Array, Array],
+    w: Array,
+    p: Array,
+    u: tuple[Array, Array],
+) -> Array:
+    """Return the state at `t` inside a slot whose ends are known: integrated, or if that fails on a straight line."""
+    share = (t - span[0]) / (span[1] - span[0])
+    try:
+        return stage.step(span[0], t - span[0], ends[0], w, p, u[0], u[0] + (u[1] - u[0]) * share)[0]
+    except FloatingPointError:
+        return ends[0] + (ends[1] - ends[0]) * share
 
 
 def trajectory_at(stage: StageFunction, trajectory: Trajectory, t: float) -> Array:
@@ -66,8 +83,5 @@ def trajectory_at(stage: StageFunction, trajectory: Trajectory, t: float) -> Arr
     if nodes[k] == t or k == 0:
         return trajectory.x[k]
     k -= 1
-    length, passed = nodes[k + 1] - nodes[k], t - nodes[k]
-    u0 = trajectory.u0[k]
-    u = u0 + (trajectory.u1[k] - u0) * (passed / length)
-    x, _ = stage.step(nodes[k], passed, trajectory.x[k], trajectory.w[k], trajectory.p, u0, u)
-    return x
+    inputs, ends = (trajectory.u0[k], trajectory.u1[k]), (trajectory.x[k], trajectory.x[k + 1])
+    return _inside(stage, t, (nodes[k], nodes[k + 1]), ends, trajectory.w[k], trajectory.p, inputs)

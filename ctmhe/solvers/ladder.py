@@ -23,6 +23,8 @@ def climb(
     notes: tuple[str, ...],
     *,
     real_time: bool = False,
+    evaluable: Callable[[], bool] = lambda: True,
+    rescue: Callable[[], Guess] | None = None,
 ) -> tuple[Solution | None, Status]:
     """Try each rung until one succeeds.
 
@@ -39,6 +41,11 @@ def climb(
         Facts about the window for the status.
     real_time : bool
         The solver's iterate at its limit is what is wanted: the first rung that gives finite numbers is the last.
+    evaluable : callable returning bool
+        Whether the model could be evaluated wherever that was tried. Where not (an FMU that fails), other solvers fail
+        too, and take long over it: they are left out.
+    rescue : callable returning a Guess, optional
+        The guess that is tried instead.
 
     Returns
     -------
@@ -68,7 +75,13 @@ def climb(
     guess = guesses[-1][1]()
     usable = [a for a in attempts if np.isfinite(a.cost)]
     start = min(usable, key=lambda a: a.feasibility + a.cost * 1e-12).point if usable else guess
-    if solver.name != reference().name:
+    stuck = not evaluable()
+    if stuck and rescue is not None:
+        solution = run("start-up state", solver, window, rescue())
+        if solution.success:
+            return solution, _status(Outcome.FALLBACK, solution, rungs, notes)
+        attempts.append(solution)
+    if not stuck and solver.name != reference().name:
         for point in (start, guess):
             solution = run("reference", reference(), window, point)
             if solution.success:
@@ -79,7 +92,7 @@ def climb(
         best = min(feasible, key=lambda a: a.cost)
         return best, _status(Outcome.ITERATION_LIMIT, best, rungs, notes)
     relaxed = window.relaxed()
-    for use in (solver, reference()):
+    for use in (solver,) if stuck else (solver, reference()):
         solution = run("relaxed bounds", use, relaxed, guess)
         if solution.success:
             violation = bound_violation(window, solution.point, solution.y[:, -1])

@@ -256,6 +256,11 @@ def model_kind(about: Description, kind: str | None, step: float | None) -> str:
         )
     if not (np.isfinite(step) and step > 0):
         raise InputError(f"step must be a positive number of seconds, got {step}")
+    fixed = about.kinds[kind].fixed_step or about.step
+    if not about.kinds[kind].variable_step and fixed and abs(step - fixed) > 1e-9 * fixed:
+        raise FmuKindError(
+            f"{about.name} takes communication steps of {fixed:g} s only: say step={fixed:g}, not {step:g}"
+        )
     return kind
 
 

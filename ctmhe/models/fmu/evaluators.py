@@ -166,7 +166,6 @@ class Evaluator:
             self.pointer = self._library.ctmhe_fmu_remote(*self._sizes, *away)
             self._end = weakref.finalize(self, self._library.ctmhe_fmu_close, self.pointer)
         self.address = ctypes.cast(self._library.ctmhe_fmu_evaluate, ctypes.c_void_p).value
-        self._seen = 0
 
     def evaluate(
         self, t: float, x: Array, u: Array, w: Array, p: Array, *, jacobian: bool = True
@@ -197,11 +196,13 @@ class Evaluator:
         self._library.ctmhe_fmu_counts(self.pointer, *pointers)
         return dict(zip(worker.CALLS, calls, strict=True)), failures.value, instances.value
 
-    def new_failures(self) -> int:
-        """Return the number of failed evaluations since this was asked last."""
-        _, failures, _ = self.counts()
-        new, self._seen = failures - self._seen, failures
-        return new
+    def begin(self) -> None:
+        """Begin a new attempt: lost worker processes are replaced again, ten times at most."""
+        self._library.ctmhe_fmu_begin(self.pointer)
+
+    def failures(self) -> int:
+        """Return the number of failed evaluations."""
+        return self._library.ctmhe_fmu_failures(self.pointer)
 
     def repeat(self, x: Array, calls: dict[str, int]) -> None:
         """Make FMI calls at x (nx,) and nothing else, for measurements."""

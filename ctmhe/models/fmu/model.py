@@ -179,14 +179,14 @@ class FmuModel:
             raise FmuError(f"{self.path.name} is closed: build the model again")
         return self._evaluators.mine()
 
-    def failures(self) -> tuple[str, ...]:
-        """Return what went wrong in this thread's evaluations since this was asked last, in words."""
+    def failures(self) -> tuple[int, str]:
+        """Return how many evaluations of this thread have failed so far, and the last one in words.
+
+        To ask is to begin a new attempt: an isolated FMU's lost processes are replaced again, ten times at most.
+        """
         evaluator = self.evaluator()
-        count = evaluator.new_failures()
-        if not count:
-            return ()
-        times = "once" if count == 1 else f"{count} times, last"
-        return (f"the FMU could not be evaluated ({times}: {evaluator.message()})",)
+        evaluator.begin()
+        return evaluator.failures(), evaluator.message()
 
     def __repr__(self) -> str:
         rows = [f"FmuModel {self.name!r} (FMI {self.description.version}, {self.path.name})"]

@@ -17,6 +17,7 @@ from ctmhe.types import Array
 
 VALUE_TOLERANCE = 1e-6  # loose enough for FMUs that solve algebraic loops by iteration
 SLOPE_TOLERANCE = 1e-4
+ROUND_OFF = 1e-12  # of a derivative that is zero, against the largest of its row
 # Relative steps of differences. The first suits exact arithmetic; the others see through the noise of algebraic loops
 # and of integrators inside a co-simulation.
 REACHES = (6e-6, 6e-5, 6e-4, 6e-3)
@@ -138,41 +139,49 @@ class Examination:
         moved = [usable[i] for i in order]
         expected = [truth[i] for i in order]
         expected_held = [np.concatenate(self.reference.evaluate(*point)) for point in held] if len(start) else expected
-        wrong = self._mismatch(self.configuration, held, expected_held)
-        if wrong:
+        modes = self._modes()
+        wrong = [self._mismatch(self._with_mode(mode), held, expected_held) for mode in modes]
+        if all(wrong) and len(start):  # would it do without parameters?
+            without = self._mismatch(self.configuration | {"np": 0}, held, expected_held)
+            wrong = [without] if without else []
+        if all(wrong) and wrong:
             raise FmuDerivativeError(
-                f"{self.name}: {wrong}, so it cannot be used in an estimator. Its values may be stale after a set, or "
-                "depend on what was evaluated before: export the FMU with a newer tool, or use it as the plant "
+                f"{self.name}: {wrong[0]}, so it cannot be used in an estimator. Its values may be stale after a set, "
+                "or depend on what was evaluated before: export the FMU with a newer tool, or use it as the plant "
                 "(FmuPlant)"
             )
         if len(start):
-            self._find_parameter_mode(moved, expected)
+            self._find_parameter_mode(moved)
         if not self.choice.exchange:
             self._same_at_any_time(usable[0])
         return usable
 
-    def _find_parameter_mode(self, points: list[Point], expected: list[Array]) -> None:
+    def _modes(self) -> tuple[int, ...]:
+        """Return how parameters may be set: as they come, or in event mode."""
+        return (0, 1) if self.choice.exchange and len(self.points[0].p) else (0,)
+
+    def _find_parameter_mode(self, points: list[Point]) -> None:
         start = self.points[0].p
         points = points if len(points) > 2 else [p._replace(p=1.05 * p.p + (p.p == 0)) for p in points]
-        expected = [np.concatenate(self.reference.evaluate(*point)) for point in points]
-        modes = (0, 1) if self.choice.exchange else (0,)
-        if not any(not self._mismatch(self._with_mode(mode), points, expected) for mode in modes):
-            j, wrong = 0, ""
-            for j in range(len(start)):
-                one = [p._replace(p=np.where(np.arange(len(start)) == j, p.p, start)) for p in points]
-                truth = [np.concatenate(self.reference.evaluate(*point)) for point in one]
-                found = [self._mismatch(self._with_mode(mode), one, truth) for mode in modes]
-                if all(found):
-                    wrong = found[0]
+
+        def mismatches(moved: list[Point]) -> list[str]:
+            truth = [np.concatenate(self.reference.evaluate(*point)) for point in moved]
+            return [self._mismatch(self._with_mode(mode), moved, truth) for mode in self._modes()]
+
+        found = mismatches(points)
+        if all(found):
+            culprit = self.columns["p"][0]  # unless one of them fails alone
+            for j, name in enumerate(self.columns["p"]):
+                alone = mismatches([p._replace(p=np.where(np.arange(len(start)) == j, p.p, start)) for p in points])
+                if all(alone):
+                    culprit, found = name, alone
                     break
-            name = self.columns["p"][j]
             raise FmuParameterError(
-                f"{self.name}: parameter {name!r} cannot be changed while the FMU runs ({wrong or 'with the others'}), "
-                f"so it cannot be estimated; leave it out of parameters=, or export the FMU with a tool that lets "
-                "tunable parameters be set"
+                f"{self.name}: parameter {culprit!r} cannot be changed while the FMU runs ({found[0]}), so it cannot "
+                "be estimated; leave it out of parameters=, or export the FMU with a tool that lets tunable parameters "
+                "be set"
             )
-        mode = next(mode for mode in modes if not self._mismatch(self._with_mode(mode), points, expected))
-        self.configuration["p_in_event_mode"] = mode
+        self.configuration["p_in_event_mode"] = self._modes()[found.index("")]
 
     def _with_mode(self, mode: int) -> dict[str, Any]:
         return self.configuration | {"p_in_event_mode": mode}
@@ -355,7 +364,7 @@ class Examination:
                 if key == "p" and self.choice.about.major == 2:  # which counts them during initialization only
                     continue
                 for n, j in zip(self.columns[key], range(part.start, part.stop), strict=True):
-                    if n not in known and any(J[i, j] != 0.0 for J in Js):
+                    if n not in known and any(abs(J[i, j]) > ROUND_OFF * np.abs(J[i]).max() for J in Js):
                         missing.append(f"{name} on {n}")
         if missing:
             self.warnings.append(

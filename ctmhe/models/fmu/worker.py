@@ -69,6 +69,8 @@ def load(path: str) -> ctypes.CDLL:
         "get": ([_pointer, _references, ctypes.c_size_t, _doubles], _int),
         "next_event": ([_pointer], _double),
         "counts": ([_pointer] * 4, None),
+        "begin": ([_pointer], None),
+        "failures": ([_pointer], ctypes.c_int64),
         "message": ([_pointer], _text),
         "repeat": ([_pointer, _pointer, _pointer], _int),
         "serve": ([_pointer, _int, _int], _int),

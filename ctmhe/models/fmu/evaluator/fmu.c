@@ -440,7 +440,7 @@ API void *ctmhe_fmu_open(const ctmhe_fmu_configuration *c, char *message, size_t
   const char *missing = find_functions(m->library, c->version, c->co_simulation, &m->f);
   if (!missing && c->directional && !(c->version == 2 ? m->f.directional2 != NULL : m->f.directional3 != NULL))
     missing = "its function for directional derivatives";
-  if (!missing && c->co_simulation && !(m->f.save && m->f.load)) missing = "its functions to save and load its state";
+  if (!missing && c->co_simulation && c->step > 0.0 && !(m->f.save && m->f.load)) missing = "its functions to save and load its state";
   if (missing) {
     snprintf(message, size, "%s is missing", missing);
     return give_up(m, message, size);
@@ -504,6 +504,13 @@ API void ctmhe_fmu_counts(void *model, int64_t *calls, int64_t *failures, int64_
   memcpy(calls, m->calls, sizeof m->calls);
   *failures = m->failures, *instances = m->instances;
 }
+
+API void ctmhe_fmu_begin(void *model) {
+  fmu *m = model;
+  if (m->away) m->away->lives = LIVES;
+}
+
+API int64_t ctmhe_fmu_failures(void *model) { return ((fmu *)model)->failures; }
 
 API const char *ctmhe_fmu_message(void *model) { return ((fmu *)model)->message; }
 

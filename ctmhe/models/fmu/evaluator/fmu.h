@@ -48,6 +48,10 @@ double ctmhe_fmu_next_event(void *model);
 
 /* What happened: counts of calls (CALLS), of failed evaluations and of instances made; the last failure in words. */
 void ctmhe_fmu_counts(void *model, int64_t *calls, int64_t *failures, int64_t *instances);
+int64_t ctmhe_fmu_failures(void *model);
+
+/* A new estimate, or a new attempt at it: lost workers are replaced again, a limited number of times. */
+void ctmhe_fmu_begin(void *model);
 const char *ctmhe_fmu_message(void *model);
 
 /* Make as many calls of each kind (CALLS) at x, mixed as an evaluation mixes them: what they cost by themselves. */

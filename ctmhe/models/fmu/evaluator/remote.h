@@ -2,6 +2,8 @@
 #ifndef CTMHE_REMOTE_H
 #define CTMHE_REMOTE_H
 
+enum { LIVES = 10 }; /* workers that may be lost until ctmhe_fmu_begin: a new one takes a while, and a solve may try often */
+
 /* A question is its kind, then t, x, u, w, p; the answer a status, then dx, y, J, or the length of a message, then
  * that. Numbers are doubles: both ends are this machine. */
 enum { ASK_DX = 1, ASK_Y = 2, ASK_J = 4 };
@@ -9,8 +11,10 @@ enum { ASK_DX = 1, ASK_Y = 2, ASK_J = 4 };
 #ifdef _WIN32
 
 struct remote {
-  int none;
+  int lives;
 };
+
+enum { LIVES = 0 };
 
 static int ask(fmu *m, double t, const double *x, const double *u, const double *w, const double *p, double *dx,
                double *y, double *J) {
@@ -33,7 +37,7 @@ API void *ctmhe_fmu_remote(int nx, int nu, int nw, int np, int ny, int in, int o
 #include <unistd.h>
 
 struct remote {
-  int nx, nu, nw, np, ny, in, out, dead;
+  int nx, nu, nw, np, ny, in, out, dead, lives;
   double seconds;
   ctmhe_fmu_renew renew;
   double buffer[];
@@ -71,7 +75,7 @@ static int lost(fmu *m, double t, const double *x, const char *what) {
   if (used + 2 < sizeof m->message) memcpy(m->message + used, "]", 2);
   m->failures++;
   m->instances++;
-  r->dead = r->renew(&r->in, &r->out);
+  r->dead = --r->lives > 0 ? r->renew(&r->in, &r->out) : 1;
   return 1;
 }
 
@@ -84,7 +88,10 @@ static int ask(fmu *m, double t, const double *x, const double *u, const double 
     int n;
   } parts[] = {{x, r->nx}, {u, r->nu}, {w, r->nw}, {p, r->np}};
   double *at = r->buffer, status;
-  if (r->dead && (r->dead = r->renew(&r->in, &r->out))) return 1;
+  if (r->dead && (r->lives <= 0 || (r->dead = r->renew(&r->in, &r->out)))) {
+    m->failures++;
+    return 1;
+  }
   *at++ = kind, *at++ = t;
   for (int k = 0; k < 4; k++)
     for (int i = 0; i < parts[k].n; i++) *at++ = parts[k].values[i];
@@ -107,7 +114,7 @@ static int ask(fmu *m, double t, const double *x, const double *u, const double 
 }
 
 static remote *new_remote(int nx, int nu, int nw, int np, int ny) {
-  const remote sizes = {nx, nu, nw, np, ny, -1, -1, 0, 0.0, NULL};
+  const remote sizes = {nx, nu, nw, np, ny, -1, -1, 0, LIVES, 0.0, NULL};
   const size_t given = question_size(&sizes), taken = answer_size(&sizes, ASK_DX | ASK_Y | ASK_J);
   remote *r = malloc(sizeof *r + (given > taken ? given : taken) * sizeof(double));
   if (r) *r = sizes;
