@@ -377,7 +377,8 @@ class MHE:
                     "smooth(state, t) gives estimates of the past"
                 )
             t = state.t
-        failures = self._failures()[0] if self._failures else 0
+        failing = self._failures
+        failures = failing()[0] if failing else 0
         since = state.since if t == state.t else state.t  # a solve repeated with what has arrived takes its own place
         if self._updates is not None:
             logs = (state.measurements, state.inputs, state.path)
@@ -389,7 +390,7 @@ class MHE:
         window, notes = self._window(state, t)
         guesses = starting_points(self.stage, state, window)
         rungs = (window, self._solver, lambda: self._reference, guesses, notes)
-        evaluable = (lambda: self._failures()[0] == failures) if self._failures else (lambda: True)
+        evaluable = (lambda: failing()[0] == failures) if failing else (lambda: True)
         nx = self.stage.nx
         held = partial(resting_guess, self.stage, window, state.start[:nx], state.start[nx:])
         solution, status = climb(*rungs, real_time=self._real_time, evaluable=evaluable, rescue=held)

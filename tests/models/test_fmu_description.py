@@ -128,7 +128,7 @@ def test_the_bundled_fmus_are_described_completely(fmi):
     assert about.variables["pressure"].description == "total pressure pA + pB"
     assert (about.start_time, about.stop_time, about.step) == (0.0, 10.0, 0.1)
     assert len(about.platforms) == 1
-    files = (f"fmi{fmi}.c", "core.c", "batch_reactor.c")
+    files = (f"fmi{fmi}.c", "core.c", "step.c", "batch_reactor.c")
     expected = (Sources(files, "C99" if fmi == 3 else ""),)
     assert about.sources == {MODEL_EXCHANGE: expected, CO_SIMULATION: expected}
 

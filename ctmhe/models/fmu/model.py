@@ -200,6 +200,12 @@ class FmuModel:
     def __reduce__(self) -> tuple[Any, ...]:
         return _reopen, (str(self.path), self._archive.digest, self._arguments)
 
+    def __enter__(self) -> FmuModel:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def close(self) -> None:
         """Free the FMU and remove its temporary folder; the model must not be used any more."""
         if self._evaluators is not None:
