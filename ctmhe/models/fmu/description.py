@@ -35,7 +35,10 @@ class Variable:
 
 @dataclass(frozen=True)
 class Interface:
-    """What an FMU offers as one kind (model exchange or co-simulation)."""
+    """What an FMU offers as one kind (model exchange or co-simulation).
+
+    `event_mode` is of FMI 3 co-simulation, `input_derivatives` (inputs that change linearly over a step) of FMI 2's.
+    """
 
     identifier: str
     directional_derivatives: bool
@@ -43,6 +46,8 @@ class Interface:
     single_instance: bool
     completed_step: bool
     variable_step: bool
+    event_mode: bool = False
+    input_derivatives: bool = False
 
 
 @dataclass(frozen=True)
