@@ -10,7 +10,6 @@ import argparse
 import hashlib
 import os
 import platform
-import shlex
 import shutil
 import subprocess
 import sys
@@ -21,8 +20,10 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
+from ctmhe.compilers import Compiler, find_compiler
 from ctmhe.errors import FmuError, InputError, MissingExtra
-from fmus.description import build_description, config_header, model_description
+from fmus.config import config_header
+from fmus.description import build_description, model_description
 from fmus.models import MODELS
 
 SOURCES = Path(__file__).parent / "src"
@@ -39,9 +40,9 @@ def build(name: str, fmi: int = 2, out: Path | None = None) -> Path:
     Parameters
     ----------
     name : str
-        A key of `fmus.models.MODELS`: `batch_reactor`, `quadrotor`, `van_der_pol`.
+        A key of `fmus.models.MODELS`; the plants are those whose description has an empty `trap`.
     fmi : int
-        2 or 3: the major version of FMI. Either FMU offers model exchange and co-simulation.
+        2 or 3: the major version of FMI.
     out : Path, optional
         Folder to copy the FMU into; the cache folder when omitted.
 
@@ -53,7 +54,7 @@ def build(name: str, fmi: int = 2, out: Path | None = None) -> Path:
     Raises
     ------
     InputError
-        The name or the version is unknown.
+        The name or the version is unknown, or the model does not exist in this version.
     FmuError
         There is no C compiler, or it fails.
     MissingExtra
@@ -63,9 +64,16 @@ def build(name: str, fmi: int = 2, out: Path | None = None) -> Path:
         raise InputError(f"there is no example FMU named '{name}': choose one of {', '.join(MODELS)}")
     if fmi not in (2, 3):
         raise InputError(f"FMI version {fmi!r} is not available: choose 2 or 3")
-    compiler = _compiler()
+    if fmi not in MODELS[name].versions:
+        raise InputError(f"{name} exists in FMI {_versions(name)} only: its point needs what FMI {fmi} does not have")
+    compiler = find_compiler()
+    if compiler is None:
+        raise FmuError(
+            "building an FMU needs a C compiler, and none of $CC, cc, gcc, clang, ziglang runs here: install one"
+            " (Debian: apt install build-essential; anywhere: pip install 'ctmhe[compile]')"
+        )
     files = _files(name, fmi)
-    key = _digest(*files, *files.values(), *FLAGS, *_identity(tuple(compiler)), _platform_folder(fmi))
+    key = _digest(*files, *files.values(), *FLAGS, compiler.identity, _platform_folder(fmi))
     target = _cache() / key[:16] / f"{name}_fmi{fmi}.fmu"
     if not target.is_file():
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -75,11 +83,16 @@ def build(name: str, fmi: int = 2, out: Path | None = None) -> Path:
     return target if out is None else _copy(target, Path(out))
 
 
+def _versions(name: str) -> str:
+    return " and ".join(map(str, MODELS[name].versions))
+
+
 def _files(name: str, fmi: int) -> dict[str, str]:
     """Texts of the FMU by their path in it; the token is a hash of all the others."""
-    units = [f"fmi{fmi}.c", "core.c", f"{name}.c"]
-    files = {f"sources/{n}": (SOURCES / n).read_text(encoding="utf-8") for n in (*units, "core.h", "model.h")}
     model = MODELS[name]
+    units = [f"fmi{fmi}.c", "core.c", "step.c", f"{model.source or name}.c"]
+    headers = ["core.h", "model.h", *(["fails.h"] if model.defect == "fails" else [])]
+    files = {f"sources/{n}": (SOURCES / n).read_text(encoding="utf-8") for n in (*units, *headers)}
     contents = _digest(*files.values(), config_header(model, ""), model_description(model, fmi, "", units))
     token = "{" + str(uuid.uuid5(uuid.NAMESPACE_OID, contents)) + "}"
     files["sources/config.h"] = config_header(model, token)
@@ -104,28 +117,6 @@ def _headers() -> Path:
     return Path(spec.origin).parent / "c-code"
 
 
-def _compiler() -> list[str]:
-    chosen = os.environ.get("CC", "").strip()
-    if chosen:
-        command = shlex.split(chosen)
-        if shutil.which(command[0]) is None:
-            raise FmuError(f"CC is set to '{chosen}', which is not an executable: correct it or unset it")
-        return command
-    for candidate in ("cc", "gcc", "clang"):
-        if shutil.which(candidate):
-            return [candidate]
-    raise FmuError(
-        "building an FMU needs a C compiler, and none of cc, gcc, clang is here: install one"
-        " (Debian: apt install build-essential) or set CC to yours"
-    )
-
-
-def _identity(compiler: Sequence[str]) -> tuple[str, ...]:
-    """The compiler's command and the first line of its version."""
-    answer = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=False)
-    return (*compiler, *answer.stdout.splitlines()[:1])
-
-
 def _platform_folder(fmi: int) -> str:
     system = platform.system()
     if system not in _SUFFIX:
@@ -143,7 +134,7 @@ def _cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ctmhe" / "fmus"
 
 
-def _pack(name: str, fmi: int, files: dict[str, str], compiler: list[str], folder: Path) -> Path:
+def _pack(name: str, fmi: int, files: dict[str, str], compiler: Compiler, folder: Path) -> Path:
     """Compile the sources in `folder` and zip them with the binary; the archive carries no dates."""
     for path, text in files.items():
         (folder / path).parent.mkdir(parents=True, exist_ok=True)
@@ -151,11 +142,13 @@ def _pack(name: str, fmi: int, files: dict[str, str], compiler: list[str], folde
     library = f"binaries/{_platform_folder(fmi)}/{name}{_SUFFIX[platform.system()]}"
     (folder / library).parent.mkdir(parents=True)
     units = [path for path in files if path.endswith(".c")]
-    command = [*compiler, *FLAGS, f"-I{_headers()}", "-Isources", *units, "-o", library, "-lm"]
+    command = [*compiler.command, *FLAGS, f"-I{_headers()}", "-Isources", *units, "-o", library, "-lm"]
     try:
         run = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     except OSError as error:
-        raise FmuError(f"the C compiler '{compiler[0]}' could not be run: {error}; set CC to another") from error
+        raise FmuError(
+            f"the C compiler '{compiler.command[0]}' could not be run: {error}; set CC to another"
+        ) from error
     if run.returncode != 0:
         raise FmuError(f"the C compiler failed on {name} (FMI {fmi}); try another through CC. It says:\n{run.stderr}")
     archive = folder / "made.fmu"
@@ -175,16 +168,23 @@ def _copy(source: Path, folder: Path) -> Path:
     return folder / source.name
 
 
+def _chosen_versions(name: str, names: Sequence[str], asked: Sequence[int] | None) -> Sequence[int]:
+    """Versions to build: of a model that was named those asked for, else those among them that exist."""
+    if name not in MODELS or (names and asked):
+        return asked or (2,)  # what cannot be built is refused there
+    return [fmi for fmi in MODELS[name].versions if fmi in (asked or (2, 3))]
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Build the FMUs named on the command line, all when none is, and print where they are."""
     parser = argparse.ArgumentParser(prog="python -m fmus.build", description="Build the example FMUs.")
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(MODELS)}; all when omitted")
     parser.add_argument("--out", type=Path, help="folder to copy the FMUs into")
-    parser.add_argument("--fmi", type=int, nargs="+", choices=(2, 3), default=[2, 3], help="versions of FMI")
+    parser.add_argument("--fmi", type=int, nargs="+", choices=(2, 3), help="versions of FMI; all that there are")
     chosen = parser.parse_args(arguments)
     try:
         for name in chosen.names or MODELS:
-            for fmi in chosen.fmi:
+            for fmi in _chosen_versions(name, chosen.names, chosen.fmi):
                 print(build(name, fmi, chosen.out))
     except (FmuError, InputError, MissingExtra) as error:
         print(error, file=sys.stderr)

@@ -1,4 +1,5 @@
-/* FMI 2.0, model exchange and co-simulation, over core.h. Variables are real and may be set at any time. */
+/* FMI 2.0, model exchange and co-simulation, over core.h. Variables are real; plants let them be set at any time. */
+#include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -6,7 +7,7 @@
 #include "fmi2Functions.h"
 
 typedef struct {
-    Values values;
+    Core core; /* first: a pointer to an instance is one to its core */
     fmi2CallbackFunctions callbacks;
     fmi2Boolean logging;
     char name[256];
@@ -20,7 +21,7 @@ static fmi2Status report(Instance *m, fmi2Status level, const char *message) {
 
 static fmi2Status status_of(Instance *m, CoreStatus status) {
     if (status == CORE_OK) return fmi2OK;
-    return report(m, status == CORE_NOT_FINITE ? fmi2Discard : fmi2Error, core_message(status));
+    return report(m, core_can_be_mended(status) ? fmi2Discard : fmi2Error, core_message(status));
 }
 
 static fmi2Status no_such_type(fmi2Component c, size_t n) {
@@ -28,6 +29,10 @@ static fmi2Status no_such_type(fmi2Component c, size_t n) {
 }
 
 /* ---- common ---- */
+
+#if DEFECT_CRASHES_AT_LOAD
+__attribute__((constructor)) static void crash(void) { abort(); }
+#endif
 
 const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
 const char *fmi2GetVersion(void) { return fmi2Version; }
@@ -41,7 +46,7 @@ fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t n, const 
 fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String token, fmi2String resources,
                               const fmi2CallbackFunctions *callbacks, fmi2Boolean visible, fmi2Boolean logging) {
     Instance *m = calloc(1, sizeof *m);
-    (void)type, (void)resources, (void)visible;
+    (void)resources, (void)visible;
     if (!m) return NULL;
     if (callbacks) m->callbacks = *callbacks;
     m->logging = logging;
@@ -51,34 +56,39 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String token, 
         free(m);
         return NULL;
     }
-    core_reset(&m->values);
+    if (status_of(m, core_open(&m->core, type == fmi2CoSimulation, 0, 0)) != fmi2OK) {
+        free(m);
+        return NULL;
+    }
     return m;
 }
 
-void fmi2FreeInstance(fmi2Component c) { free(c); }
+void fmi2FreeInstance(fmi2Component c) {
+    if (c) core_close(c);
+    free(c);
+}
 
 fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_tolerance, fmi2Real tolerance, fmi2Real start,
                                fmi2Boolean has_stop, fmi2Real stop) {
     (void)has_tolerance, (void)tolerance, (void)has_stop, (void)stop;
-    ((Instance *)c)->values.v[VR_TIME] = start;
-    return fmi2OK;
+    return status_of(c, core_set_time(c, start));
 }
 
-fmi2Status fmi2EnterInitializationMode(fmi2Component c) { return (void)c, fmi2OK; }
-fmi2Status fmi2ExitInitializationMode(fmi2Component c) { return (void)c, fmi2OK; }
-fmi2Status fmi2Terminate(fmi2Component c) { return (void)c, fmi2OK; }
+fmi2Status fmi2EnterInitializationMode(fmi2Component c) { return status_of(c, core_enter(c, INITIALIZATION)); }
+fmi2Status fmi2ExitInitializationMode(fmi2Component c) { return status_of(c, core_exit_initialization(c)); }
+fmi2Status fmi2Terminate(fmi2Component c) { return status_of(c, core_enter(c, TERMINATED)); }
 
 fmi2Status fmi2Reset(fmi2Component c) {
-    core_reset(&((Instance *)c)->values);
+    core_reset(c);
     return fmi2OK;
 }
 
 fmi2Status fmi2GetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n, fmi2Real value[]) {
-    return status_of(c, core_get(&((Instance *)c)->values, vr, n, value));
+    return status_of(c, core_get(c, vr, n, value, n));
 }
 
 fmi2Status fmi2SetReal(fmi2Component c, const fmi2ValueReference vr[], size_t n, const fmi2Real value[]) {
-    return status_of(c, core_set(&((Instance *)c)->values, vr, n, value));
+    return status_of(c, core_set(c, vr, n, value, n));
 }
 
 #define NO_TYPE(Type)                                                                                              \
@@ -94,17 +104,17 @@ NO_TYPE(String)
 
 /* ---- state ---- */
 
+#if SAVES_STATE
+
 fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state) {
     if (!*state) *state = malloc(sizeof(Values));
     if (!*state) return report(c, fmi2Error, "out of memory");
-    memcpy(*state, &((Instance *)c)->values, sizeof(Values));
-    return fmi2OK;
+    return status_of(c, core_save(c, *state));
 }
 
 fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state) {
     if (!state) return report(c, fmi2Error, "no FMU state was given");
-    memcpy(&((Instance *)c)->values, state, sizeof(Values));
-    return fmi2OK;
+    return status_of(c, core_load(c, state));
 }
 
 fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *state) {
@@ -134,68 +144,69 @@ fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size
     return fmi2OK;
 }
 
+#else
+
+static fmi2Status no_state(fmi2Component c) { return status_of(c, CORE_NOT_OFFERED); }
+
+fmi2Status fmi2GetFMUstate(fmi2Component c, fmi2FMUstate *state) { return (void)state, no_state(c); }
+fmi2Status fmi2SetFMUstate(fmi2Component c, fmi2FMUstate state) { return (void)state, no_state(c); }
+fmi2Status fmi2FreeFMUstate(fmi2Component c, fmi2FMUstate *state) { return (void)state, no_state(c); }
+fmi2Status fmi2SerializedFMUstateSize(fmi2Component c, fmi2FMUstate state, size_t *size) {
+    return (void)state, (void)size, no_state(c);
+}
+fmi2Status fmi2SerializeFMUstate(fmi2Component c, fmi2FMUstate state, fmi2Byte bytes[], size_t size) {
+    return (void)state, (void)bytes, (void)size, no_state(c);
+}
+fmi2Status fmi2DeSerializeFMUstate(fmi2Component c, const fmi2Byte bytes[], size_t size, fmi2FMUstate *state) {
+    return (void)bytes, (void)size, (void)state, no_state(c);
+}
+
+#endif
+
 fmi2Status fmi2GetDirectionalDerivative(fmi2Component c, const fmi2ValueReference unknowns[], size_t n_unknowns,
                                         const fmi2ValueReference knowns[], size_t n_knowns, const fmi2Real seed[],
                                         fmi2Real sensitivity[]) {
-    return status_of(c, core_directional(&((Instance *)c)->values, unknowns, n_unknowns, knowns, n_knowns, seed,
-                                         sensitivity));
+    return status_of(c, core_directional(c, unknowns, n_unknowns, knowns, n_knowns, seed, sensitivity, n_unknowns));
 }
 
 /* ---- model exchange ---- */
 
-fmi2Status fmi2EnterEventMode(fmi2Component c) { return (void)c, fmi2OK; }
-fmi2Status fmi2EnterContinuousTimeMode(fmi2Component c) { return (void)c, fmi2OK; }
+fmi2Status fmi2EnterEventMode(fmi2Component c) { return status_of(c, core_enter(c, EVENT)); }
+fmi2Status fmi2EnterContinuousTimeMode(fmi2Component c) { return status_of(c, core_enter(c, CONTINUOUS_TIME)); }
 
 fmi2Status fmi2NewDiscreteStates(fmi2Component c, fmi2EventInfo *info) {
-    (void)c;
-    memset(info, 0, sizeof *info); /* nothing is discrete: all flags false */
-    return fmi2OK;
+    EventReport event;
+    CoreStatus status = core_event(c, &event);
+    memset(info, 0, sizeof *info); /* one round is enough for every model, and none asks to end */
+    info->valuesOfContinuousStatesChanged = event.states_changed;
+    info->nextEventTimeDefined = isfinite(event.next);
+    info->nextEventTime = info->nextEventTimeDefined ? event.next : 0.0;
+    return status_of(c, status);
 }
 
 fmi2Status fmi2CompletedIntegratorStep(fmi2Component c, fmi2Boolean no_rollback, fmi2Boolean *enter_event_mode,
                                        fmi2Boolean *terminate) {
-    (void)c, (void)no_rollback;
-    *enter_event_mode = *terminate = fmi2False;
-    return fmi2OK;
+    (void)no_rollback;
+    *terminate = fmi2False;
+    return status_of(c, core_completed(c, enter_event_mode));
 }
 
-fmi2Status fmi2SetTime(fmi2Component c, fmi2Real time) {
-    ((Instance *)c)->values.v[VR_TIME] = time;
-    return fmi2OK;
-}
-
-static fmi2Status count(fmi2Component c, size_t n) {
-    return n == NX ? fmi2OK : report(c, fmi2Error, "wrong number of continuous states");
-}
+fmi2Status fmi2SetTime(fmi2Component c, fmi2Real time) { return status_of(c, core_set_time(c, time)); }
 
 fmi2Status fmi2SetContinuousStates(fmi2Component c, const fmi2Real x[], size_t n) {
-    if (count(c, n) != fmi2OK) return fmi2Error;
-    core_set_states(&((Instance *)c)->values, x);
-    return fmi2OK;
+    return status_of(c, core_set_states(c, x, n));
 }
-
 fmi2Status fmi2GetDerivatives(fmi2Component c, fmi2Real dx[], size_t n) {
-    if (count(c, n) != fmi2OK) return fmi2Error;
-    core_get_derivatives(&((Instance *)c)->values, dx);
-    return fmi2OK;
+    return status_of(c, core_get_derivatives(c, dx, n));
 }
-
 fmi2Status fmi2GetEventIndicators(fmi2Component c, fmi2Real indicators[], size_t n) {
-    (void)indicators;
-    return n == 0 ? fmi2OK : report(c, fmi2Error, "this FMU has no event indicators");
+    return status_of(c, core_get_indicators(c, indicators, n));
 }
-
 fmi2Status fmi2GetContinuousStates(fmi2Component c, fmi2Real x[], size_t n) {
-    if (count(c, n) != fmi2OK) return fmi2Error;
-    memcpy(x, ((Instance *)c)->values.v + VR_X, NX * sizeof(double));
-    return fmi2OK;
+    return status_of(c, core_get_states(c, x, n));
 }
-
 fmi2Status fmi2GetNominalsOfContinuousStates(fmi2Component c, fmi2Real nominals[], size_t n) {
-    static const double x_nominal[] = X_NOMINAL;
-    if (count(c, n) != fmi2OK) return fmi2Error;
-    memcpy(nominals, x_nominal, NX * sizeof(double));
-    return fmi2OK;
+    return status_of(c, core_get_nominals(c, nominals, n));
 }
 
 /* ---- co-simulation ---- */
@@ -213,8 +224,9 @@ fmi2Status fmi2GetRealOutputDerivatives(fmi2Component c, const fmi2ValueReferenc
 }
 
 fmi2Status fmi2DoStep(fmi2Component c, fmi2Real t, fmi2Real h, fmi2Boolean no_rollback) {
+    StepReport end;
     (void)no_rollback;
-    return status_of(c, core_step(&((Instance *)c)->values, t, h));
+    return status_of(c, core_step(c, t, h, &end));
 }
 
 fmi2Status fmi2CancelStep(fmi2Component c) { return report(c, fmi2Error, "steps are not asynchronous"); }
@@ -230,6 +242,6 @@ NO_STATUS(StringStatus, fmi2String)
 
 fmi2Status fmi2GetRealStatus(fmi2Component c, const fmi2StatusKind kind, fmi2Real *value) {
     if (kind != fmi2LastSuccessfulTime) return report(c, fmi2Discard, "steps are not asynchronous");
-    *value = ((Instance *)c)->values.v[VR_TIME];
+    *value = ((Instance *)c)->core.values.v[VR_TIME];
     return fmi2OK;
 }

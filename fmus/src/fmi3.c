@@ -1,4 +1,5 @@
-/* FMI 3.0, model exchange and co-simulation, over core.h. Variables are Float64 and may be set at any time. */
+/* FMI 3.0, model exchange and co-simulation, over core.h. Plants let their variables be set at any time. */
+#include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -6,7 +7,7 @@
 #include "fmi3Functions.h"
 
 typedef struct {
-    Values values;
+    Core core; /* first: a pointer to an instance is one to its core */
     fmi3InstanceEnvironment environment;
     fmi3LogMessageCallback log;
 } Instance;
@@ -18,14 +19,14 @@ static fmi3Status report(Instance *m, fmi3Status level, const char *message) {
 
 static fmi3Status status_of(Instance *m, CoreStatus status) {
     if (status == CORE_OK) return fmi3OK;
-    return report(m, status == CORE_NOT_FINITE ? fmi3Discard : fmi3Error, core_message(status));
+    return report(m, core_can_be_mended(status) ? fmi3Discard : fmi3Error, core_message(status));
 }
 
 static fmi3Status none(fmi3Instance c, size_t n, const char *message) {
     return n == 0 ? fmi3OK : report(c, fmi3Error, message);
 }
 
-static const char *const float_only = "this FMU has Float64 variables only";
+static const char *const no_type = "this FMU has no variables of this type";
 static const char *const no_clocks = "this FMU has no clocks";
 
 /* ---- common ---- */
@@ -36,8 +37,10 @@ fmi3Status fmi3SetDebugLogging(fmi3Instance c, fmi3Boolean on, size_t n, const f
     return (void)c, (void)on, (void)n, (void)categories, fmi3OK;
 }
 
-static fmi3Instance instantiate(fmi3String token, fmi3InstanceEnvironment environment, fmi3LogMessageCallback log) {
+static fmi3Instance instantiate(fmi3String token, int co_simulation, int event_mode, int early_return,
+                                fmi3InstanceEnvironment environment, fmi3LogMessageCallback log) {
     Instance *m = calloc(1, sizeof *m);
+    if (DEFECT_CRASHES_AT_LOAD) abort();
     if (!m) return NULL;
     m->environment = environment;
     m->log = log;
@@ -46,7 +49,10 @@ static fmi3Instance instantiate(fmi3String token, fmi3InstanceEnvironment enviro
         free(m);
         return NULL;
     }
-    core_reset(&m->values);
+    if (status_of(m, core_open(&m->core, co_simulation, event_mode, early_return)) != fmi3OK) {
+        free(m);
+        return NULL;
+    }
     return m;
 }
 
@@ -54,7 +60,7 @@ fmi3Instance fmi3InstantiateModelExchange(fmi3String name, fmi3String token, fmi
                                           fmi3Boolean visible, fmi3Boolean logging,
                                           fmi3InstanceEnvironment environment, fmi3LogMessageCallback log) {
     (void)name, (void)resources, (void)visible, (void)logging;
-    return instantiate(token, environment, log);
+    return instantiate(token, 0, 0, 0, environment, log);
 }
 
 fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3String resources,
@@ -62,9 +68,9 @@ fmi3Instance fmi3InstantiateCoSimulation(fmi3String name, fmi3String token, fmi3
                                          fmi3Boolean early_return, const fmi3ValueReference intermediate[],
                                          size_t n_intermediate, fmi3InstanceEnvironment environment,
                                          fmi3LogMessageCallback log, fmi3IntermediateUpdateCallback update) {
-    (void)name, (void)resources, (void)visible, (void)logging, (void)event_mode, (void)early_return;
+    (void)name, (void)resources, (void)visible, (void)logging;
     (void)intermediate, (void)n_intermediate, (void)update;
-    return instantiate(token, environment, log);
+    return instantiate(token, 1, event_mode, early_return, environment, log);
 }
 
 fmi3Instance fmi3InstantiateScheduledExecution(fmi3String name, fmi3String token, fmi3String resources,
@@ -77,46 +83,47 @@ fmi3Instance fmi3InstantiateScheduledExecution(fmi3String name, fmi3String token
     return NULL;
 }
 
-void fmi3FreeInstance(fmi3Instance c) { free(c); }
+void fmi3FreeInstance(fmi3Instance c) {
+    if (c) core_close(c);
+    free(c);
+}
 
 fmi3Status fmi3EnterInitializationMode(fmi3Instance c, fmi3Boolean has_tolerance, fmi3Float64 tolerance,
                                        fmi3Float64 start, fmi3Boolean has_stop, fmi3Float64 stop) {
     (void)has_tolerance, (void)tolerance, (void)has_stop, (void)stop;
-    ((Instance *)c)->values.v[VR_TIME] = start;
-    return fmi3OK;
+    CoreStatus status = core_set_time(c, start);
+    return status_of(c, status == CORE_OK ? core_enter(c, INITIALIZATION) : status);
 }
 
-fmi3Status fmi3ExitInitializationMode(fmi3Instance c) { return (void)c, fmi3OK; }
-fmi3Status fmi3EnterEventMode(fmi3Instance c) { return (void)c, fmi3OK; }
-fmi3Status fmi3Terminate(fmi3Instance c) { return (void)c, fmi3OK; }
-fmi3Status fmi3EnterConfigurationMode(fmi3Instance c) { return (void)c, fmi3OK; }
-fmi3Status fmi3ExitConfigurationMode(fmi3Instance c) { return (void)c, fmi3OK; }
+fmi3Status fmi3ExitInitializationMode(fmi3Instance c) { return status_of(c, core_exit_initialization(c)); }
+fmi3Status fmi3EnterEventMode(fmi3Instance c) { return status_of(c, core_enter(c, EVENT)); }
+fmi3Status fmi3Terminate(fmi3Instance c) { return status_of(c, core_enter(c, TERMINATED)); }
+fmi3Status fmi3EnterConfigurationMode(fmi3Instance c) { return status_of(c, core_enter(c, CONFIGURATION)); }
+fmi3Status fmi3ExitConfigurationMode(fmi3Instance c) { return status_of(c, core_enter(c, INSTANTIATED)); }
 
 fmi3Status fmi3Reset(fmi3Instance c) {
-    core_reset(&((Instance *)c)->values);
+    core_reset(c);
     return fmi3OK;
 }
 
 fmi3Status fmi3GetFloat64(fmi3Instance c, const fmi3ValueReference vr[], size_t n, fmi3Float64 values[],
                           size_t n_values) {
-    if (n != n_values) return report(c, fmi3Error, "all variables are scalar: as many values as references");
-    return status_of(c, core_get(&((Instance *)c)->values, vr, n, values));
+    return status_of(c, core_get(c, vr, n, values, n_values));
 }
 
 fmi3Status fmi3SetFloat64(fmi3Instance c, const fmi3ValueReference vr[], size_t n, const fmi3Float64 values[],
                           size_t n_values) {
-    if (n != n_values) return report(c, fmi3Error, "all variables are scalar: as many values as references");
-    return status_of(c, core_set(&((Instance *)c)->values, vr, n, values));
+    return status_of(c, core_set(c, vr, n, values, n_values));
 }
 
 #define NO_TYPE(Type)                                                                                         \
     fmi3Status fmi3Get##Type(fmi3Instance c, const fmi3ValueReference vr[], size_t n, fmi3##Type values[],    \
                              size_t n_values) {                                                               \
-        return (void)vr, (void)values, (void)n_values, none(c, n, float_only);                                \
+        return (void)vr, (void)values, (void)n_values, none(c, n, no_type);                                \
     }                                                                                                         \
     fmi3Status fmi3Set##Type(fmi3Instance c, const fmi3ValueReference vr[], size_t n,                         \
                              const fmi3##Type values[], size_t n_values) {                                    \
-        return (void)vr, (void)values, (void)n_values, none(c, n, float_only);                                \
+        return (void)vr, (void)values, (void)n_values, none(c, n, no_type);                                \
     }
 NO_TYPE(Float32)
 NO_TYPE(Int8)
@@ -126,18 +133,36 @@ NO_TYPE(UInt16)
 NO_TYPE(Int32)
 NO_TYPE(UInt32)
 NO_TYPE(Int64)
-NO_TYPE(UInt64)
 NO_TYPE(Boolean)
 NO_TYPE(String)
 
 fmi3Status fmi3GetBinary(fmi3Instance c, const fmi3ValueReference vr[], size_t n, size_t sizes[],
                          fmi3Binary values[], size_t n_values) {
-    return (void)vr, (void)sizes, (void)values, (void)n_values, none(c, n, float_only);
+    return (void)vr, (void)sizes, (void)values, (void)n_values, none(c, n, no_type);
 }
 
 fmi3Status fmi3SetBinary(fmi3Instance c, const fmi3ValueReference vr[], size_t n, const size_t sizes[],
                          const fmi3Binary values[], size_t n_values) {
-    return (void)vr, (void)sizes, (void)values, (void)n_values, none(c, n, float_only);
+    return (void)vr, (void)sizes, (void)values, (void)n_values, none(c, n, no_type);
+}
+
+/* Structural parameters are the only variables that are whole numbers. */
+fmi3Status fmi3GetUInt64(fmi3Instance c, const fmi3ValueReference vr[], size_t n, fmi3UInt64 values[],
+                         size_t n_values) {
+    CoreStatus status = n == n_values ? CORE_OK : CORE_BAD_SIZE;
+    for (size_t i = 0; i < n && status == CORE_OK; i++) {
+        double value = 0.0;
+        status = core_get_structural(c, vr[i], &value);
+        values[i] = (fmi3UInt64)value;
+    }
+    return status_of(c, status);
+}
+
+fmi3Status fmi3SetUInt64(fmi3Instance c, const fmi3ValueReference vr[], size_t n, const fmi3UInt64 values[],
+                         size_t n_values) {
+    CoreStatus status = n == n_values ? CORE_OK : CORE_BAD_SIZE;
+    for (size_t i = 0; i < n && status == CORE_OK; i++) status = core_set_structural(c, vr[i], (double)values[i]);
+    return status_of(c, status);
 }
 
 /* The dependencies are in the model description. */
@@ -154,17 +179,17 @@ fmi3Status fmi3GetVariableDependencies(fmi3Instance c, fmi3ValueReference depend
 
 /* ---- state ---- */
 
+#if SAVES_STATE
+
 fmi3Status fmi3GetFMUState(fmi3Instance c, fmi3FMUState *state) {
     if (!*state) *state = malloc(sizeof(Values));
     if (!*state) return report(c, fmi3Error, "out of memory");
-    memcpy(*state, &((Instance *)c)->values, sizeof(Values));
-    return fmi3OK;
+    return status_of(c, core_save(c, *state));
 }
 
 fmi3Status fmi3SetFMUState(fmi3Instance c, fmi3FMUState state) {
     if (!state) return report(c, fmi3Error, "no FMU state was given");
-    memcpy(&((Instance *)c)->values, state, sizeof(Values));
-    return fmi3OK;
+    return status_of(c, core_load(c, state));
 }
 
 fmi3Status fmi3FreeFMUState(fmi3Instance c, fmi3FMUState *state) {
@@ -194,25 +219,41 @@ fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const fmi3Byte bytes[], size_
     return fmi3OK;
 }
 
+#else
+
+static fmi3Status no_state(fmi3Instance c) { return status_of(c, CORE_NOT_OFFERED); }
+
+fmi3Status fmi3GetFMUState(fmi3Instance c, fmi3FMUState *state) { return (void)state, no_state(c); }
+fmi3Status fmi3SetFMUState(fmi3Instance c, fmi3FMUState state) { return (void)state, no_state(c); }
+fmi3Status fmi3FreeFMUState(fmi3Instance c, fmi3FMUState *state) { return (void)state, no_state(c); }
+fmi3Status fmi3SerializedFMUStateSize(fmi3Instance c, fmi3FMUState state, size_t *size) {
+    return (void)state, (void)size, no_state(c);
+}
+fmi3Status fmi3SerializeFMUState(fmi3Instance c, fmi3FMUState state, fmi3Byte bytes[], size_t size) {
+    return (void)state, (void)bytes, (void)size, no_state(c);
+}
+fmi3Status fmi3DeserializeFMUState(fmi3Instance c, const fmi3Byte bytes[], size_t size, fmi3FMUState *state) {
+    return (void)bytes, (void)size, (void)state, no_state(c);
+}
+
+#endif
+
 /* ---- derivatives ---- */
 
 fmi3Status fmi3GetDirectionalDerivative(fmi3Instance c, const fmi3ValueReference unknowns[], size_t n_unknowns,
                                         const fmi3ValueReference knowns[], size_t n_knowns,
                                         const fmi3Float64 seed[], size_t n_seed, fmi3Float64 sensitivity[],
                                         size_t n_sensitivity) {
-    if (n_seed != n_knowns || n_sensitivity != n_unknowns)
-        return report(c, fmi3Error, "one seed a known and one sensitivity an unknown");
-    return status_of(c, core_directional(&((Instance *)c)->values, unknowns, n_unknowns, knowns, n_knowns, seed,
-                                         sensitivity));
+    if (n_seed != n_knowns) return status_of(c, CORE_BAD_SIZE);
+    return status_of(
+        c, core_directional(c, unknowns, n_unknowns, knowns, n_knowns, seed, sensitivity, n_sensitivity));
 }
 
 fmi3Status fmi3GetAdjointDerivative(fmi3Instance c, const fmi3ValueReference unknowns[], size_t n_unknowns,
                                     const fmi3ValueReference knowns[], size_t n_knowns, const fmi3Float64 seed[],
                                     size_t n_seed, fmi3Float64 sensitivity[], size_t n_sensitivity) {
-    if (n_seed != n_unknowns || n_sensitivity != n_knowns)
-        return report(c, fmi3Error, "one seed an unknown and one sensitivity a known");
-    return status_of(
-        c, core_adjoint(&((Instance *)c)->values, unknowns, n_unknowns, knowns, n_knowns, seed, sensitivity));
+    if (n_sensitivity != n_knowns) return status_of(c, CORE_BAD_SIZE);
+    return status_of(c, core_adjoint(c, unknowns, n_unknowns, knowns, n_knowns, seed, n_seed, sensitivity));
 }
 
 /* ---- clocks: none ---- */
@@ -257,71 +298,59 @@ fmi3Status fmi3ActivateModelPartition(fmi3Instance c, fmi3ValueReference clock, 
     return (void)clock, (void)time, report(c, fmi3Error, no_clocks);
 }
 
-/* ---- model exchange ---- */
+/* ---- events ---- */
 
 fmi3Status fmi3EvaluateDiscreteStates(fmi3Instance c) { return (void)c, fmi3OK; }
 
 fmi3Status fmi3UpdateDiscreteStates(fmi3Instance c, fmi3Boolean *again, fmi3Boolean *terminate,
                                     fmi3Boolean *nominals_changed, fmi3Boolean *states_changed,
                                     fmi3Boolean *next_event, fmi3Float64 *next_time) {
-    (void)c, (void)next_time;
-    *again = *terminate = *nominals_changed = *states_changed = *next_event = fmi3False;
-    return fmi3OK;
+    EventReport event;
+    CoreStatus status = core_event(c, &event);
+    *again = *terminate = *nominals_changed = fmi3False; /* one round is enough for every model */
+    *states_changed = event.states_changed != 0;
+    *next_event = isfinite(event.next) != 0;
+    *next_time = *next_event ? event.next : 0.0;
+    return status_of(c, status);
 }
 
-fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c) { return (void)c, fmi3OK; }
+fmi3Status fmi3EnterContinuousTimeMode(fmi3Instance c) { return status_of(c, core_enter(c, CONTINUOUS_TIME)); }
+fmi3Status fmi3EnterStepMode(fmi3Instance c) { return status_of(c, core_enter(c, STEP)); }
+
+/* ---- model exchange ---- */
 
 fmi3Status fmi3CompletedIntegratorStep(fmi3Instance c, fmi3Boolean no_rollback, fmi3Boolean *enter_event_mode,
                                        fmi3Boolean *terminate) {
-    (void)c, (void)no_rollback;
-    *enter_event_mode = *terminate = fmi3False;
-    return fmi3OK;
+    int enter;
+    CoreStatus status = core_completed(c, &enter);
+    (void)no_rollback;
+    *enter_event_mode = enter != 0;
+    *terminate = fmi3False;
+    return status_of(c, status);
 }
 
-fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 time) {
-    ((Instance *)c)->values.v[VR_TIME] = time;
-    return fmi3OK;
-}
-
-static fmi3Status count(fmi3Instance c, size_t n) {
-    return n == NX ? fmi3OK : report(c, fmi3Error, "wrong number of continuous states");
-}
+fmi3Status fmi3SetTime(fmi3Instance c, fmi3Float64 time) { return status_of(c, core_set_time(c, time)); }
 
 fmi3Status fmi3SetContinuousStates(fmi3Instance c, const fmi3Float64 x[], size_t n) {
-    if (count(c, n) != fmi3OK) return fmi3Error;
-    core_set_states(&((Instance *)c)->values, x);
-    return fmi3OK;
+    return status_of(c, core_set_states(c, x, n));
 }
-
 fmi3Status fmi3GetContinuousStateDerivatives(fmi3Instance c, fmi3Float64 dx[], size_t n) {
-    if (count(c, n) != fmi3OK) return fmi3Error;
-    core_get_derivatives(&((Instance *)c)->values, dx);
-    return fmi3OK;
+    return status_of(c, core_get_derivatives(c, dx, n));
 }
-
 fmi3Status fmi3GetEventIndicators(fmi3Instance c, fmi3Float64 indicators[], size_t n) {
-    return (void)indicators, none(c, n, "this FMU has no event indicators");
+    return status_of(c, core_get_indicators(c, indicators, n));
 }
-
 fmi3Status fmi3GetContinuousStates(fmi3Instance c, fmi3Float64 x[], size_t n) {
-    if (count(c, n) != fmi3OK) return fmi3Error;
-    memcpy(x, ((Instance *)c)->values.v + VR_X, NX * sizeof(double));
-    return fmi3OK;
+    return status_of(c, core_get_states(c, x, n));
 }
-
 fmi3Status fmi3GetNominalsOfContinuousStates(fmi3Instance c, fmi3Float64 nominals[], size_t n) {
-    static const double x_nominal[] = X_NOMINAL;
-    if (count(c, n) != fmi3OK) return fmi3Error;
-    memcpy(nominals, x_nominal, NX * sizeof(double));
-    return fmi3OK;
+    return status_of(c, core_get_nominals(c, nominals, n));
 }
 
-fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance c, size_t *n) { return (void)c, *n = 0, fmi3OK; }
+fmi3Status fmi3GetNumberOfEventIndicators(fmi3Instance c, size_t *n) { return (void)c, *n = NZ, fmi3OK; }
 fmi3Status fmi3GetNumberOfContinuousStates(fmi3Instance c, size_t *n) { return (void)c, *n = NX, fmi3OK; }
 
 /* ---- co-simulation ---- */
-
-fmi3Status fmi3EnterStepMode(fmi3Instance c) { return (void)c, fmi3OK; }
 
 fmi3Status fmi3GetOutputDerivatives(fmi3Instance c, const fmi3ValueReference vr[], size_t n,
                                     const fmi3Int32 orders[], fmi3Float64 values[], size_t n_values) {
@@ -330,10 +359,12 @@ fmi3Status fmi3GetOutputDerivatives(fmi3Instance c, const fmi3ValueReference vr[
 
 fmi3Status fmi3DoStep(fmi3Instance c, fmi3Float64 t, fmi3Float64 h, fmi3Boolean no_rollback,
                       fmi3Boolean *event, fmi3Boolean *terminate, fmi3Boolean *early, fmi3Float64 *last) {
-    Instance *m = c;
-    CoreStatus status = core_step(&m->values, t, h);
+    StepReport end;
+    CoreStatus status = core_step(c, t, h, &end);
     (void)no_rollback;
-    *event = *terminate = *early = fmi3False;
-    *last = status == CORE_OK ? m->values.v[VR_TIME] : t;
-    return status_of(m, status);
+    *event = end.event != 0;
+    *early = end.early != 0;
+    *terminate = fmi3False;
+    *last = end.time;
+    return status_of(c, status);
 }

@@ -36,7 +36,8 @@ static Vec torque(const double x[], const double u[], const double p[]) {
     }};
 }
 
-void model_evaluate(const double x[], const double u[], const double p[], double dx[], double y[]) {
+void model_evaluate(const double x[], const double u[], const double p[], const double q[], double dx[], double y[]) {
+    (void)q;
     double sf = sin(x[X_phi]), cf = cos(x[X_phi]), tt = tan(x[X_theta]), ct = cos(x[X_theta]);
     double turn = sf * x[X_O2] + cf * x[X_O3];
     Vec f = rotate(x, force(x, u, p)), tau = torque(x, u, p);
@@ -52,8 +53,9 @@ void model_evaluate(const double x[], const double u[], const double p[], double
     for (int i = 0; i < 6; i++) y[Y_y_z1 + i] = x[X_z1 + i];
 }
 
-void model_tangent(const double x[], const double u[], const double p[],
+void model_tangent(const double x[], const double u[], const double p[], const double q[],
                    const double sx[], const double su[], const double sp[], double ddx[], double dy[]) {
+    (void)q;
     double sf = sin(x[X_phi]), cf = cos(x[X_phi]), st = sin(x[X_theta]), ct = cos(x[X_theta]), tt = st / ct;
     double turn = sf * x[X_O2] + cf * x[X_O3], pitch = cf * x[X_O2] - sf * x[X_O3];
     double d_turn = sx[X_phi] * pitch + sf * sx[X_O2] + cf * sx[X_O3];
