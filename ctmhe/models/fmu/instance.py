@@ -16,7 +16,15 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctmhe.errors import FmuBinaryError, FmuError, FmuEventError, FmuKindError, FmuUnsupportedError, MissingExtra
+from ctmhe.errors import (
+    FmuBinaryError,
+    FmuError,
+    FmuEventError,
+    FmuKindError,
+    FmuParameterError,
+    FmuUnsupportedError,
+    MissingExtra,
+)
 from ctmhe.models.fmu.description import CO_SIMULATION, MODEL_EXCHANGE, Description, Interface, Variable
 from ctmhe.models.fmu.messages import callbacks2, listener3
 from ctmhe.types import Array
@@ -24,6 +32,7 @@ from ctmhe.types import Array
 log = logging.getLogger(__name__)
 
 OK, DISCARD, ERROR, FATAL, PENDING = 0, 2, 3, 4, 5
+_STATUS = {DISCARD: "discard", ERROR: "error", FATAL: "fatal error", PENDING: "pending"}
 _TERMINATED, _LAST_TIME = 3, 2  # kinds of status that FMI 2 can be asked for after a discarded step
 MOST_ROUNDS = 1000  # of one event iteration
 
@@ -272,6 +281,7 @@ class Instance:
             raise FmuError(f"{self.description.name} is closed; start it again or build a new one")
         if self._life.failure and (self._life.fatal or name not in {"setFMUState", "freeFMUState"}):
             raise FmuError(f"{self._life.failure}. It takes no more calls: start it again")
+        self.messages.clear()
         try:
             return getattr(self._fmu, name)(*arguments)
         except Exception as error:
@@ -279,9 +289,10 @@ class Instance:
 
     def _failure(self, call: str, error: Exception, about: Iterable[str]) -> FmuError:
         names = ", ".join(about)
-        what = f"{call} of {names}" if names else call
-        text = f"{self.description.name}: {what} failed: {error}{self._told()}"
+        what = getattr(error, "function", call) + (f" of {names}" if names else "")
         status = getattr(error, "status", ERROR if isinstance(error, OSError) else OK)
+        reason = _STATUS.get(status, str(error))
+        text = f"{self.description.name}: {what} failed: {reason}{self._told()}"
         if status == DISCARD:
             return Discard(text)
         if status >= ERROR:
@@ -289,17 +300,30 @@ class Instance:
         return FmuError(text)
 
     def initialize(self, t: float, values: Mapping[str, float], tolerance: float | None = None) -> Event:
-        """Initialize at time `t` with start values by name (inputs, parameters, settable states)."""
+        """Initialize at time `t` with start values by name (inputs, parameters, settable states).
+
+        Raises
+        ------
+        FmuParameterError
+            If the FMU refuses a start value.
+        FmuBinaryError
+            If it cannot be initialized with them.
+        """
         chosen = [self.description.variables[name] for name in values]
         numbers = list(values.values())
-        self.messages.clear()
-        self.set(chosen, numbers)
-        if self._version == 2:
-            self._call("setupExperiment", tolerance, t)
-            self._call("enterInitializationMode")
-        else:
-            self._call("enterInitializationMode", tolerance, t)
-        self._call("exitInitializationMode")
+        try:
+            self.set(chosen, numbers)
+        except FmuError as error:
+            raise FmuParameterError(f"{error}. Leave these start values to the FMU") from error
+        try:
+            if self._version == 2:
+                self._call("setupExperiment", tolerance, t)
+                self._call("enterInitializationMode")
+            else:
+                self._call("enterInitializationMode", tolerance, t)
+            self._call("exitInitializationMode")
+        except FmuError as error:
+            raise FmuBinaryError(f"{error}. It cannot be initialized at t = {t:.9g} with these start values") from error
         self._life.running = True
         return self._iterate(t) if self.event_mode else Event(False, False, np.inf)
 
