@@ -80,11 +80,14 @@ class CoSimulation:
                 self.instance.set_slopes(self._inputs, slope)
             try:
                 step = self.instance.do_step(self.t, length)
-            except Discard as error:
+            except FmuEventError:
+                raise
+            except FmuError as error:
                 length /= 2.0
-                if self._fixed or length < SHORTEST * whole:
-                    raise self._stuck(end, error) from error
-                continue
+                if isinstance(error, Discard) and not self._fixed and length >= SHORTEST * whole:
+                    continue
+                what = f"the step to t = {end:.9g} stopped at t = {self.t:.9g}"
+                raise self._runner.stuck(what, str(error), self.t) from error
             stayed = step.t <= self.t
             self.t = end if end - step.t <= 1e-12 * max(1.0, abs(end), whole) else max(self.t, step.t)
             if step.event:
@@ -95,13 +98,6 @@ class CoSimulation:
                     "Give the switching in the model a hysteresis, or let it come to rest"
                 )
             length *= 2.0
-
-    def _stuck(self, end: float, error: FmuError) -> FmuError:
-        name = self._about.name
-        return FmuError(
-            f"{name}: the step to t = {end:.9g} stopped at t = {self.t:.9g}: {str(error).removeprefix(f'{name}: ')}. "
-            "The plant is there now; restore a checkpoint, or start again with other values or a smaller step="
-        )
 
     def _count(self, span: float, *, varying: bool) -> int:
         step = self._step

@@ -111,11 +111,7 @@ class ModelExchange:
         return rooted
 
     def _stuck(self, t: float, x: Array, reason: str) -> FmuError:
-        name = self._about.name
-        return FmuError(
-            f"{name}: the integration stopped at t = {t:.9g}{self._shown(x)}: {reason.removeprefix(f'{name}: ')}. The "
-            f"plant is at t = {self.t:.9g} now; restore a checkpoint, or start again with other values"
-        )
+        return self._runner.stuck(f"the integration stopped at t = {t:.9g}{self._shown(x)}", reason, self.t)
 
     def _shown(self, x: Array) -> str:
         shown = [f"{v.name} = {value:.6g}" for v, value in zip(self._about.states, x.tolist(), strict=True)]
@@ -125,9 +121,9 @@ class ModelExchange:
     def _follow(self, t: float, before: Array, after: Array, push: Array) -> None:
         slope = np.where(self._smooth, (after - before) / (t - self.t) if t > self.t else 0.0, 0.0)
         joined = np.allclose(before, self._present(self.t), 1e-9, self._noise)
-        if joined and not self._fresh and self._line is not None and np.array_equal(push, self._push):
-            if np.allclose(slope, self._line[2], 1e-9, self._noise):
-                return
+        goes_on = joined and not self._fresh and self._line is not None and np.array_equal(push, self._push)
+        if goes_on and self._line is not None and np.allclose(slope, self._line[2], 1e-9, self._noise):
+            return
         self._line, self._push, self._fresh = (self.t, before, slope), push, True
         if joined:
             self._place(self.t, self._x)
@@ -183,7 +179,9 @@ class ModelExchange:
                 self.instance.set_states(x)
             rates = self.instance.derivatives() + self._push
             if not np.isfinite(rates).all():
-                wrong = [v.name for v, rate in zip(self._about.derivatives, rates, strict=True) if not np.isfinite(rate)]
+                wrong = [
+                    v.name for v, rate in zip(self._about.derivatives, rates, strict=True) if not np.isfinite(rate)
+                ]
                 raise Discard(f"{', '.join(wrong[:LISTED])} not finite")
         except Discard as error:
             self._refusal = str(error)

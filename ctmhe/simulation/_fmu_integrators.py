@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import itertools
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -80,8 +81,9 @@ class Cvode:
         self.name = f"scikits.odes CVODE, rtol {rtol:g}"
         self._messages: list[Any] = []
         self._failure: Exception | None = None
-        self._origin, self._unit, self._limited, self._solver = 0.0, 1.0, False, None
-        self._last = 0.0, np.zeros(0)
+        self._origin, self._unit, self._limited = 0.0, 1.0, False
+        self._solver: Any = None
+        self._last: tuple[float, Array] = (0.0, np.zeros(0))
 
     def to(self, t: float, fresh: tuple[float, Array] | None, limit: float) -> tuple[float, Array, bool]:
         self._messages.clear()
@@ -91,7 +93,6 @@ class Cvode:
             self._begin(*fresh, stop)
         elif self._step_by_step and not self._move_stop(t):
             self._begin(*self._last, stop)
-        assert self._solver is not None
         end = (t - self._origin) / self._unit
         answer = self._solver.step(end)
         if self._failure is not None:
@@ -148,47 +149,57 @@ class Cvode:
 
 
 class Lsoda:
-    """SciPy's LSODA, begun afresh at every call; when evaluations fail, once more from there with shorter steps."""
+    """SciPy's LSODA, begun afresh for every target; when evaluations fail, once more from there with shorter steps."""
 
     def __init__(
         self, derivatives: Function, roots: Function, count: int, rtol: float, atol: Array, *, step_by_step: bool
     ):
-        self._functions, self._count, self._tolerances = (derivatives, roots), count, (rtol, atol)
-        self._step_by_step = step_by_step
+        self._functions, self._count, self._step_by_step = (derivatives, roots), count, step_by_step
+        self._options: dict[str, Any] = {"rtol": rtol, "atol": atol}
         self.name = f"SciPy LSODA, rtol {rtol:g}"
-        self._last = 0.0, np.zeros(0)
+        self._last: tuple[float, Array] = (0.0, np.zeros(0))
+        self._signs = np.zeros(count, dtype=bool)
+        self._solver: Any = None
 
     def to(self, t: float, fresh: tuple[float, Array] | None, limit: float) -> tuple[float, Array, bool]:
         self._last = fresh or self._last
         span = t - self._last[0]
-        for retry in range(RETRIES):
+        if fresh is not None or self._solver is None or self._solver.t_bound != t:
+            self._begin(t, np.inf)
+        refusal = ""
+        for retry in range(1, RETRIES):
             try:
-                return self._follow(t, span / 4.0**retry if retry else np.inf)
+                return self._follow()
             except Discard as error:
-                refusal = error
+                refusal = str(error)
+                self._begin(t, span / 4.0**retry)
         raise IntegrationError(*self._last, f"no step was small enough: {refusal}")
 
-    def _follow(self, t: float, longest: float) -> tuple[float, Array, bool]:
+    def _begin(self, t: float, longest: float) -> None:
         from scipy.integrate import LSODA
 
         derivatives, roots = self._functions
-        rtol, atol = self._tolerances
-        options: Any = {"rtol": rtol, "atol": atol, "max_step": longest}
-        solver: Any = LSODA(derivatives, *self._last, t, **options)
-        before = roots(*self._last) > 0.0
+        self._signs = roots(*self._last) > 0.0
+        self._solver = LSODA(derivatives, *self._last, t, max_step=longest, **self._options)
+
+    def _follow(self) -> tuple[float, Array, bool]:
+        roots, solver = self._functions[1], self._solver
         while solver.status == "running":
             message = solver.step()
             if solver.status == "failed" or not np.isfinite(solver.y).all():
                 raise IntegrationError(*self._last, message or "it left the finite numbers")
-            if self._count and ((roots(solver.t, solver.y) > 0.0) != before).any():
-                path = solver.dense_output()
-                end = first_change(lambda t: roots(t, path(t)) > 0.0, before, solver.t_old, solver.t)
-                self._last = (end, np.array(path(end)))
+            if self._count and ((roots(solver.t, solver.y) > 0.0) != self._signs).any():
+                self._last = self._located(solver)
                 return *self._last, True
             self._last = (float(solver.t), solver.y.copy())
             if self._step_by_step:
                 break
         return *self._last, False
+
+    def _located(self, solver: Any) -> tuple[float, Array]:
+        roots, path = self._functions[1], solver.dense_output()
+        end = first_change(lambda t: roots(t, path(t)) > 0.0, self._signs, solver.t_old, solver.t)
+        return end, np.array(path(end))
 
 
 class Stateless:
@@ -204,8 +215,7 @@ class Stateless:
         self._t = t
         if self._count:
             before = self._roots(begin, x) > 0.0
-            edges = np.linspace(begin, t, PIECES + 1).tolist()
-            for low, high in zip(edges[:-1], edges[1:], strict=True):
+            for low, high in itertools.pairwise(np.linspace(begin, t, PIECES + 1).tolist()):
                 if ((self._roots(high, x) > 0.0) != before).any():
                     self._t = first_change(lambda t: self._roots(t, x) > 0.0, before, low, high)
                     return self._t, x, True

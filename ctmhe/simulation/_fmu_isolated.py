@@ -17,10 +17,11 @@ from typing import IO, Any
 from ctmhe.errors import FmuBinaryError, FmuError
 from ctmhe.models.fmu.description import Variable
 from ctmhe.simulation._fmu_engines import Setup
+from ctmhe.simulation._fmu_worker import HUNG
 from ctmhe.types import Array
 
 PATIENCE = 5.0  # seconds until a process that should end is ended
-_DUMPS = ("Fatal Python error", "Timeout (")  # what faulthandler begins with
+LAST_WORDS = 3  # lines of what the process printed that a message shows
 _keys = itertools.count()
 
 
@@ -53,9 +54,9 @@ class Isolated:
         self._ask("start", t, dict(values), dict(x))
 
     def _launch(self) -> None:
-        self._said = tempfile.TemporaryFile()
+        self._said = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-        command = [sys.executable, "-m", "ctmhe.simulation._fmu_worker"]
+        command = [sys.executable, "-c", "from ctmhe.simulation._fmu_worker import main; main()"]
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(
             command, stdin=pipe, stdout=pipe, stderr=self._said, env=environment, start_new_session=True
@@ -92,13 +93,14 @@ class Isolated:
     def _lost(self, method: str) -> FmuBinaryError:
         """Return what to raise after the process ended by itself."""
         assert self._process is not None and self._said is not None
-        self._process.kill()  # it closed its streams, which is the end in any case
-        code = self._process.wait()
+        try:
+            code = self._process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:  # only its streams are closed
+            self._process.kill()
+            code = self._process.wait()
         self._said.seek(0)
-        lines = self._said.read().decode("utf-8", "replace").splitlines()
-        dumps = [i for i, line in enumerate(lines) if line.startswith(_DUMPS)]
-        words = " / ".join(line.strip() for line in lines[: dumps[0] if dumps else None][-3:])
-        if dumps and lines[dumps[0]].startswith(_DUMPS[1]):
+        words = " / ".join(self._said.read().decode("utf-8", "replace").splitlines()[-LAST_WORDS:])
+        if code == HUNG:
             what = f"did not come back from {method} within {self._timeout:g} s"
         else:
             what = f"ended its process during {method} ({_told(code)})"

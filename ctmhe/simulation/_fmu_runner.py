@@ -77,6 +77,15 @@ class Runner:
                 self.close()
                 self._instance = Instance(self._about, self._folder, self._kind)
 
+    def stuck(self, what: str, reason: str, t: float) -> FmuError:
+        """Return the error of a way that ended at `t` before its end."""
+        name = self._about.name
+        if self.instance.failed:
+            advice = f"The FMU takes no more calls after that: start again, from t = {t:.9g} if you like"
+        else:
+            advice = f"The plant is at t = {t:.9g} now: restore a checkpoint, or start again with other values"
+        return FmuError(f"{name}: {what}: {reason.removeprefix(f'{name}: ')}. {advice}")
+
     def save(self) -> SavedState | None:
         """Return the inside of the FMU, None when it does not offer that."""
         return self.instance.save() if self.instance.interface.get_set_state else None

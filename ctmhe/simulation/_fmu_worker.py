@@ -1,19 +1,44 @@
-"""The process in which an isolated FMU runs: `python -m ctmhe.simulation._fmu_worker`, started by `_fmu_isolated`.
+"""The process in which an isolated FMU runs; `_fmu_isolated` starts it.
 
 Requests and replies are pickles on the standard streams, so that no port is opened and the end of the parent, however
-it comes, ends this process. The watchdog is faulthandler's: it works while the FMU does not give the control back.
+it comes, ends this process.
 """
 
 from __future__ import annotations
 
-import faulthandler
 import os
 import pickle
+import threading
+import time
 import traceback
 from typing import Any, BinaryIO
 
 from ctmhe.errors import FmuError
 from ctmhe.simulation._fmu_engines import Setup
+
+HUNG = 124  # exit code, as of the command timeout
+CHECKS = 20  # of the time limit within its length
+
+
+class Watchdog:
+    """Ends the process when a call takes longer than `limit` seconds; it can, since calls into an FMU free the GIL."""
+
+    def __init__(self, limit: float | None):
+        self._limit, self._deadline = limit, float("inf")
+        if limit is not None:
+            threading.Thread(target=self._watch, args=(limit / CHECKS,), daemon=True).start()
+
+    def __enter__(self) -> None:
+        if self._limit is not None:
+            self._deadline = time.monotonic() + self._limit
+
+    def __exit__(self, *_: object) -> None:
+        self._deadline = float("inf")
+
+    def _watch(self, pause: float) -> None:
+        while time.monotonic() < self._deadline:
+            time.sleep(pause)
+        os._exit(HUNG)
 
 
 class Served:
@@ -58,23 +83,21 @@ class Served:
 def serve(requests: BinaryIO, replies: BinaryIO) -> None:
     """Answer requests until there are no more."""
     setup, timeout = pickle.load(requests)
-    served = Served(setup)
+    served, watchdog = Served(setup), Watchdog(timeout)
     while True:
         try:
             forgotten, method, arguments = pickle.load(requests)
         except EOFError:
             break
-        if timeout is not None:
-            faulthandler.dump_traceback_later(timeout, exit=True)
-        served.forget(forgotten)
         error, value = None, None
         try:
-            value = served.answer(method, *arguments)
+            with watchdog:
+                served.forget(forgotten)
+                value = served.answer(method, *arguments)
         except FmuError as problem:
             error = type(problem), str(problem)
         except Exception:
             error = RuntimeError, traceback.format_exc()
-        faulthandler.cancel_dump_traceback_later()
         pickle.dump((error, value, served.t), replies)
         replies.flush()
     served.close()
@@ -82,13 +105,8 @@ def serve(requests: BinaryIO, replies: BinaryIO) -> None:
 
 def main() -> None:
     """Keep the standard streams for the requests; what the FMU prints goes to the standard error."""
-    faulthandler.enable()
     requests, replies = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)
     os.dup2(2, 1)
     serve(requests, replies)
-
-
-if __name__ == "__main__":
-    main()

@@ -438,7 +438,7 @@ class Instance:
         return np.array(self._call("getDirectionalDerivative", *arguments, about=names), dtype=np.float64)
 
     def set_slopes(self, variables: Sequence[Variable], values: ArrayLike) -> None:
-        """Set the time derivatives of inputs over the next step (co-simulation, FMI 2, `interface.input_derivatives`)."""
+        """Set the time derivatives of inputs over the next step (FMI 2, where `interface.input_derivatives`)."""
         references = [variable.reference for variable in variables]
         slopes = np.asarray(values, float).tolist()
         names = (variable.name for variable in variables)
