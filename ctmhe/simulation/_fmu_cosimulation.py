@@ -36,6 +36,9 @@ class CoSimulation:
         length = f"steps of {self._step} s" if self._step else "steps as they come"
         self.method = f"the FMU itself (co-simulation, {length})"
         self.t, self._held = 0.0, np.zeros(len(self._inputs))
+        events = description.major > 2 and self._interface.event_mode  # then discrete inputs change in event mode only
+        self._free = np.array([not events or v.variability != "discrete" for v in self._inputs], dtype=bool)
+        self._settable = [v for v, free in zip(self._inputs, self._free, strict=True) if free]
 
     @property
     def instance(self) -> Instance:
@@ -60,11 +63,11 @@ class CoSimulation:
         if self.instance.event_mode and not np.array_equal(before, self._held):
             self.instance.event(self.t, self._inputs, before)
         slope = (after - before) / span
-        self._held = after
+        self._held = np.where(self._free, after, before)
         for k in range(count):
             end = t if k == count - 1 else begin + span * (k + 1) / count
             if not self._interface.input_derivatives:
-                self.instance.set(self._inputs, before + (after - before) * (k + 0.5) / count)
+                self._set(before + (after - before) * (k + 0.5) / count)
             self._go(end, before + slope * (self.t - begin), slope)
 
     def _go(self, end: float, value: Array, slope: Array) -> None:
@@ -114,8 +117,11 @@ class CoSimulation:
         return count
 
     def get(self, variables: Sequence[Variable], inputs: Array) -> Array:
-        self.instance.set(self._inputs, inputs)
+        self._set(inputs)
         return self.instance.get(variables)
+
+    def _set(self, values: Array) -> None:
+        self.instance.set(self._settable, values[self._free])
 
     def checkpoint(self) -> Checkpoint:
         saved = self._runner.save()

@@ -15,7 +15,7 @@ from ctmhe.simulation._fmu_runner import Checkpoint, Crowd, Runner, cannot_retur
 from ctmhe.types import Array
 
 LISTED = 6  # states that a message shows
-BELOW = 1e-200  # how far below zero an event indicator counts at least that is not positive
+LEAST, MOST = 1e-30, 1e30  # what an indicator counts: never zero, and nothing that single precision cannot hold
 
 
 class ModelExchange:
@@ -27,8 +27,8 @@ class ModelExchange:
     does then (delays, switching of states) depends on the steps. After an `advance` that fails the plant is where the
     last event was on the way, or where it was before.
 
-    An event is due when an indicator becomes positive or stops being so. The sign that counts is the one with which
-    the FMU left event mode, so that indicators which are zero there are not overlooked.
+    An event is due when an indicator becomes positive or stops being so: zero is no sign of its own, and an indicator
+    that is zero where event mode is left is not overlooked.
     """
 
     def __init__(self, description: Description, folder: Path, inputs: Sequence[Variable], rtol: float, atol: float):
@@ -67,12 +67,12 @@ class ModelExchange:
         self._held = self.instance.get(self._inputs)
         self._scale(self._own_nominals)
         self._take(event)
-        names = [state.name for state in self._about.states]
-        for name, value in x.items():
-            if name in names:
+        late = {name: value for name, value in x.items() if name not in settable}
+        if late:
+            names = [state.name for state in self._about.states]
+            for name, value in late.items():
                 self._x[names.index(name)] = value
-        self._place(t, self._x)
-        self._positive = self._signs()
+            self._handle_event()
         self._eventful = bool(
             len(self._positive) or np.isfinite(event.next_time) or self._interface.completed_step
         ) or not all(self._smooth)
@@ -196,7 +196,7 @@ class ModelExchange:
         if not np.isfinite(values).all():
             wrong = ", ".join(str(i + 1) for i in np.flatnonzero(~np.isfinite(values)))
             raise FmuError(f"event indicators {wrong} are not finite")
-        return np.where(self._positive, values, values - BELOW)
+        return np.where(values > 0.0, np.clip(values, LEAST, MOST), np.clip(values, -MOST, -LEAST))
 
     def _signs(self) -> Array:
         return self.instance.event_indicators() > 0.0

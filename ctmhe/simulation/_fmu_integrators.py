@@ -113,10 +113,10 @@ class Cvode:
         if self._solver is None:
             module = importlib.import_module("scikits_odes_sundials.cvode")
             self._solver, begin = module.CVODE(self._derivatives, **self._options), "init_step"
-        if limited or self._limited:
+        getattr(self._solver, begin)(0.0, np.array(x))
+        if limited or self._limited:  # after the beginning: a stop before the present time is refused
             self._solver.set_options(tstop=1.0 if limited else _NO_STOP)
         self._limited = limited
-        getattr(self._solver, begin)(0.0, np.array(x))
 
     def _move_stop(self, t: float) -> bool:
         stop = (t - self._origin) / self._unit

@@ -238,14 +238,36 @@ class FmuPlant:
         return np.concatenate([u, w[self._driven_at]])
 
     def state(self) -> Array:
-        """Return the true state now (nx,)."""
-        return self.engine.get(self._states, self._now)
+        """Return the true state now (nx,).
+
+        Raises
+        ------
+        FmuError
+            If the FMU says that it is not finite.
+        """
+        return self._read(self._states, self._now)
 
     def output(self, u: Array, w: Array) -> Array:
-        """Return the outputs now (ny,), with inputs `u` (nu,) and disturbance `w` (nw,)."""
+        """Return the outputs now (ny,), with inputs `u` (nu,) and disturbance `w` (nw,).
+
+        Raises
+        ------
+        FmuError
+            If the FMU says that one is not finite; NaN would be taken for a missing measurement.
+        """
         disturbance = self.w.vector(w, "FmuPlant.output")
-        values = self.engine.get(self._outputs, self._drive(self.u.vector(u, "FmuPlant.output"), disturbance))
+        values = self._read(self._outputs, self._drive(self.u.vector(u, "FmuPlant.output"), disturbance))
         return values + disturbance[self._push.shape[1] :]
+
+    def _read(self, variables: Sequence[Variable], inputs: Array) -> Array:
+        values = self.engine.get(variables, inputs)
+        if not np.isfinite(values).all():
+            wrong = [f"{v.name} = {x}" for v, x in zip(variables, values.tolist(), strict=True) if not np.isfinite(x)]
+            raise FmuError(
+                f"{self.name}: {', '.join(wrong)} at t = {self.engine.t:.9g}; restore a checkpoint, or start again with "
+                "other values"
+            )
+        return values
 
     def checkpoint(self) -> object:
         """Return where the plant is, for `restore`; what it keeps is freed with the object.
