@@ -81,7 +81,7 @@ class Runner:
         """Return the error of a way that ended at `t` before its end."""
         name = self._about.name
         if self.instance.failed:
-            advice = f"The FMU takes no more calls after that: start again, from t = {t:.9g} if you like"
+            advice = "The FMU takes no more calls after that: restore a checkpoint if it lets you, or start again"
         else:
             advice = f"The plant is at t = {t:.9g} now: restore a checkpoint, or start again with other values"
         return FmuError(f"{name}: {what}: {reason.removeprefix(f'{name}: ')}. {advice}")

@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 INTEGERS, REALS = 14, 8  # arguments that are looked at; registers hold eight real ones
 LONGEST = 2000  # characters kept of one text
 NULL_PAGE = 4096  # no text lies below: what a format takes for an address there is none
-_CONVERSION = re.compile(r"%([-+ #0]*)(\*|\d+)?(?:\.(\*|\d*))?(hh|h|ll|l|z|j|t|q|I64)?([diouxXcsfFeEgGaAp%])")
+_CONVERSION = re.compile(r"%([-+ #0]*)(\*|\d{1,3})?(?:\.(\*|\d{0,3}))?(hh|h|ll|l|z|j|t|q|I64)?([diouxXcsfFeEgGaAp%])")
 _SIZES = {"hh": "b", "h": "h", "": "i", "l": "l", "ll": "q", "z": "N", "j": "q", "t": "n", "q": "q", "I64": "q"}
 
 # Where the arguments after the five named ones are. A callback that declares more parameters than it was given reads
@@ -96,9 +96,9 @@ def _filled(match: re.Match[str], integers: Iterator[int], reals: Iterator[float
         return "%"
     try:
         if width == "*":
-            width = str(_sized(next(integers), "i"))
+            width = str(_length(next(integers)))
         if precision == "*":
-            precision = str(_sized(next(integers), "i"))
+            precision = str(_length(next(integers)))
         value: Any
         if kind == "s":
             value = _text_at(next(integers))
@@ -116,6 +116,13 @@ def _filled(match: re.Match[str], integers: Iterator[int], reals: Iterator[float
         return f"%{flags}{width or ''}{'' if precision is None else '.' + precision}{kind}" % value
     except (StopIteration, ValueError, OverflowError):
         return None
+
+
+def _length(slot: int) -> int:
+    length = _sized(slot, "i")
+    if abs(length) > LONGEST:
+        raise ValueError(f"a field of {length} characters")
+    return length
 
 
 def _sized(slot: int, code: str) -> int:
