@@ -52,7 +52,7 @@ class FmuBinaryError(FmuError):
 
 
 class FmuUnsupportedError(FmuError):
-    """The FMU needs what is not supported, or does not offer what is needed: arrays, no outputs, no way back in time."""
+    """The FMU needs what is not supported, or lacks what is needed: arrays; no states, outputs or way back in time."""
 
 
 class FmuEventError(FmuError):

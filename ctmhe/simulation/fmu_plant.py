@@ -264,8 +264,8 @@ class FmuPlant:
         if not np.isfinite(values).all():
             wrong = [f"{v.name} = {x}" for v, x in zip(variables, values.tolist(), strict=True) if not np.isfinite(x)]
             raise FmuError(
-                f"{self.name}: {', '.join(wrong)} at t = {self.engine.t:.9g}; restore a checkpoint, or start again with "
-                "other values"
+                f"{self.name}: {', '.join(wrong)} at t = {self.engine.t:.9g}; restore a checkpoint, or start "
+                "again with other values"
             )
         return values
 

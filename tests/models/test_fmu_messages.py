@@ -5,7 +5,9 @@ from collections import deque
 
 import pytest
 
-fmi2 = pytest.importorskip("fmpy.fmi2")
+pytest.importorskip("fmpy")
+
+from fmpy import fmi2
 
 from ctmhe.models.fmu.messages import callbacks2, formatted
 

@@ -101,7 +101,7 @@ def test_a_time_event_sees_its_very_time(on_paper, integrator):
 
 
 def test_an_indicator_that_is_zero_at_the_start_is_watched(on_paper, integrator):
-    """What is not positive when event mode is left causes an event on becoming positive, also when it begins at zero."""
+    """What is not positive when event mode is left is an event on becoming positive, also if it begins at zero."""
     model = Paper(states={"x": 0.0}, discretes={"above": 0.0}, indicators=2)
     model.rates = lambda m: {"x": 1.0}
     model.indicate = lambda m: [m.x["x"], m.x["x"] - 1.0]

@@ -112,7 +112,7 @@ def test_after_an_error_no_call_reaches_the_fmu(on_paper):
     with FmuPlant(path, disturbances=()) as plant:
         with pytest.raises(FmuError):
             go(plant, 1.0)
-        with pytest.raises(FmuError, match="failed: error.*takes no more calls: start it again"):
+        with pytest.raises(FmuError, match=r"failed: error.*takes no more calls: start it again"):
             plant.state()
 
 

@@ -140,7 +140,7 @@ def test_errors_keep_their_types_on_the_way(child):
     plant = child(2)
     process = plant.engine._process
     plant.start(0.0, [0.5, 4.0])
-    with pytest.raises(FmuError, match="fails: the integration stopped at t = .*an error happened"):
+    with pytest.raises(FmuError, match=r"fails: the integration stopped at t = .*an error happened"):
         go(plant, 1.0)
     plant.start(0.0, None)
     assert plant.engine._process is process
