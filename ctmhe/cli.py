@@ -1,4 +1,4 @@
-"""The command line: `ctmhe demo`, `estimate`, `fmu info`, `reproduce`."""
+"""The command line: `ctmhe demo`, `estimate`, `fmu info`, `fmu build`, `reproduce`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-fmu_app = typer.Typer(help="Look into FMUs.", no_args_is_help=True)
+fmu_app = typer.Typer(help="Look into FMUs, and compile them.", no_args_is_help=True)
 app.add_typer(fmu_app, name="fmu")
 
 
@@ -92,6 +92,19 @@ def fmu_info(path: Annotated[Path, typer.Argument(help="The FMU.")]) -> None:
     typer.echo(describe(path))
 
 
+@fmu_app.command("build")
+def fmu_build(
+    path: Annotated[Path, typer.Argument(help="An FMU with C sources.")],
+    out: Annotated[
+        Path | None, typer.Option(help="The FMU to write; beside the given one, with the platform in its name.")
+    ] = None,
+) -> None:
+    """Compile the C sources of an FMU for this platform, into a new FMU."""
+    from ctmhe.models.fmu.building import build
+
+    typer.echo(f"written: {build(path, out)}")
+
+
 @app.command()
 def reproduce(
     case: Annotated[str, typer.Argument(help="Name of a published result, such as thesis-3.4.1-ct; `list` shows all.")],
@@ -117,11 +130,12 @@ def reproduce(
 
 
 def main() -> None:
-    """Run the command line; an error of this library is one readable paragraph and exit code 1."""
+    """Run the command line; an error of this library is a readable text and exit code 1."""
     try:
         app()
     except CtmheError as error:
-        typer.echo(textwrap.fill(f"ctmhe: {error}", 100, break_long_words=False), err=True)
+        lines = f"ctmhe: {error}".splitlines()  # a compiler's words keep their lines
+        typer.echo("\n".join(textwrap.fill(line, 100, break_long_words=False) for line in lines), err=True)
         raise SystemExit(1) from None
 
 

@@ -30,7 +30,7 @@ class CoSimulation:
         self._interface = description.kinds[CO_SIMULATION]
         self._runner = Runner(description, folder, CO_SIMULATION)
         self._fixed = not self._interface.variable_step
-        self._step = step or (description.step if self._fixed else None)
+        self._step = step or ((self._interface.fixed_step or description.step) if self._fixed else None)
         if self._fixed and self._step is None:
             raise FmuError(f"{description.name} needs communication steps of one length; give it with step=")
         length = f"steps of {self._step} s" if self._step else "steps as they come"

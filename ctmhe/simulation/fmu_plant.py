@@ -12,7 +12,7 @@ import numpy as np
 from ctmhe.errors import FmuError, FmuKindError, FmuUnsupportedError, InputError
 from ctmhe.models.fmu.archive import Unpacked
 from ctmhe.models.fmu.description import CO_SIMULATION, MODEL_EXCHANGE, Description, Variable, signals_of
-from ctmhe.models.fmu.instance import read_description
+from ctmhe.models.fmu.reading import read_description
 from ctmhe.models.signals import Signals
 from ctmhe.simulation._fmu_engines import Engine, Setup
 from ctmhe.simulation._fmu_isolated import Isolated
@@ -347,8 +347,11 @@ def rebuilt(path: Path, digest: str, arguments: Mapping[str, Any]) -> FmuPlant:
 def plant_parameters(about: Description, values: Mapping[str, float]) -> dict[str, float]:
     """Return checked values, by name, of variables that may be set at initialization."""
     known: tuple[Variable, ...] = tuple(v for v in about.variables.values() if v.settable and v.causality != "input")
-    chosen = about.select("parameter", list(values), known)
-    numbers = {v.name: float(value) for v, value in zip(chosen, values.values(), strict=True)}
+    numbers = {
+        variable.name: float(value)
+        for name, value in values.items()
+        for variable in about.select("parameter", name, known)
+    }
     for name, value in numbers.items():
         if not np.isfinite(value):
             raise InputError(f"FmuPlant: parameter {name!r} is {value}, not finite")

@@ -23,7 +23,8 @@ from ctmhe.models.continuous import ContinuousModel, Model
 from ctmhe.models.fmu import FmuModel
 from ctmhe.models.fmu.archive import Unpacked
 from ctmhe.models.fmu.description import CO_SIMULATION, MODEL_EXCHANGE
-from ctmhe.models.fmu.instance import Instance, read_description
+from ctmhe.models.fmu.instance import Instance
+from ctmhe.models.fmu.reading import read_description
 from fmus.build import build
 
 X = np.array([2.3, 0.7])

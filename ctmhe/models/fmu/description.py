@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import platform
+import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from ctmhe.models.fmu.selection import select
+from ctmhe.models.fmu.units import Unit
 from ctmhe.models.signals import Signals
 
 MODEL_EXCHANGE, CO_SIMULATION = "ModelExchange", "CoSimulation"
+SYSTEMS = {"win32": "win", "cygwin": "win", "darwin": "darwin"}
+ARCHITECTURES = {"amd64": "x86_64", "x86_64": "x86_64", "arm64": "aarch64", "aarch64": "aarch64", "i686": "x86"}
+LIBRARY_SUFFIXES = {"win": ".dll", "darwin": ".dylib"}
 
 
 @dataclass(frozen=True)
 class Variable:
-    """One real scalar variable of an FMU; `start`, `minimum` and `maximum` are None where not given."""
+    """One real scalar variable of an FMU; `start`, `minimum` and `maximum` are None where not given.
+
+    `unit` and `description` are empty where not given; `nominal` is then 1, as it is where zero or not finite.
+    """
 
     name: str
     reference: int
@@ -24,6 +34,7 @@ class Variable:
     start: float | None
     minimum: float | None
     maximum: float | None
+    description: str = ""
 
     @property
     def settable(self) -> bool:
@@ -37,7 +48,9 @@ class Variable:
 class Interface:
     """What an FMU offers as one kind (model exchange or co-simulation).
 
-    `event_mode` is of FMI 3 co-simulation, `input_derivatives` (inputs that change linearly over a step) of FMI 2's.
+    `event_mode`, `early_return` and `fixed_step` (seconds, None where not stated) are of FMI 3 co-simulation;
+    `input_derivatives` (inputs that change linearly over a step) is of FMI 2 co-simulation; `needs_tool` says that
+    the binary only calls the tool that made it.
     """
 
     identifier: str
@@ -46,8 +59,24 @@ class Interface:
     single_instance: bool
     completed_step: bool
     variable_step: bool
+    needs_tool: bool = False
     event_mode: bool = False
+    early_return: bool = False
+    fixed_step: float | None = None
     input_derivatives: bool = False
+
+
+@dataclass(frozen=True)
+class Sources:
+    """Files that are compiled together into a binary; paths are relative to the FMU's folder `sources`.
+
+    `defines` are (macro, value) or (macro, "") for those without a value; `language` is as written, such as `C99`.
+    """
+
+    files: tuple[str, ...]
+    language: str = ""
+    defines: tuple[tuple[str, str], ...] = ()
+    includes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -65,12 +94,22 @@ class Description:
     variables : mapping name -> Variable
         All real scalars (aliases included).
     states, derivatives, inputs, outputs, parameters : tuple of Variable
-        `derivatives[i]` is d `states[i]` / dt. `parameters` are the tunable and the fixed ones.
+        `derivatives[i]` is d `states[i]` / dt. `parameters` are the tunable and the fixed ones. Alias names of FMI 3
+        are in `variables` only.
     event_indicators : int
     unsupported : mapping name -> reason
-        Variables that are arrays or structural parameters.
-    step, tolerance : float or None
-        Of the default experiment.
+        Structural parameters, and arrays that are input, output, parameter, state, derivative or event indicator.
+    step, tolerance, start_time, stop_time : float or None
+        Of the default experiment; times in seconds.
+    dependencies : mapping name -> tuple of names, or None
+        What each derivative and output says it depends on; None where it does not say.
+    units : mapping name -> Unit
+        Those whose SI base units are given.
+    platforms : tuple of str
+        Folders in `binaries`.
+    sources : mapping kind -> tuple of Sources
+        Empty for an FMU without C files.
+    description : str
     """
 
     version: str
@@ -88,19 +127,56 @@ class Description:
     unsupported: Mapping[str, str]
     step: float | None
     tolerance: float | None
+    start_time: float | None = None
+    stop_time: float | None = None
+    dependencies: Mapping[str, tuple[str, ...] | None] = field(default_factory=dict)
+    units: Mapping[str, Unit] = field(default_factory=dict)
+    platforms: tuple[str, ...] = ()
+    sources: Mapping[str, tuple[Sources, ...]] = field(default_factory=dict)
+    description: str = ""
 
     @property
     def major(self) -> int:
         """Major version of the FMI standard, 2 or 3."""
         return int(self.version.split(".")[0])
 
-    def select(self, role: str, names: Iterable[str] | str | None, known: Sequence[Variable]) -> tuple[Variable, ...]:
-        """Return the variables of `names`, all of `known` when None; an unknown name raises with the nearest."""
-        if names is None:
-            return tuple(known)
-        wanted = (names,) if isinstance(names, str) else tuple(names)
-        signals = Signals.of(role, [variable.name for variable in known])
-        return tuple(known[signals.index(name)] for name in wanted)
+    def select(self, role: str, wanted: Iterable[str] | str | None, known: Sequence[Variable]) -> tuple[Variable, ...]:
+        """Return those of `known` that `wanted` says, each once.
+
+        Parameters
+        ----------
+        role : str
+            What they are, for messages: `input`, `state`, ...
+        wanted : str, iterable of str, or None
+            Names; patterns with `*` and `?` (`zone*.T`; brackets are part of a name); `causality:output`,
+            `variability:tunable` and their like. None means all. A name that is there wins over a pattern.
+        known : sequence of Variable
+
+        Returns
+        -------
+        tuple of Variable
+            In the order of `wanted`, within a pattern in that of `known`.
+
+        Raises
+        ------
+        InputError
+            Nothing fits one of `wanted`; with the nearest names.
+        """
+        return select(role, wanted, known)
+
+
+def platform_folder(major: int) -> str:
+    """Return the folder of this platform's binaries: `linux64` and its like for FMI 2, `x86_64-linux` for FMI 3."""
+    system = SYSTEMS.get(sys.platform, "linux")
+    if major == 2:
+        return system + ("64" if sys.maxsize > 2**32 else "32")
+    machine = platform.machine().lower()
+    return f"{ARCHITECTURES.get(machine, machine)}-{'windows' if system == 'win' else system}"
+
+
+def library_suffix() -> str:
+    """Return how the file name of a binary ends here."""
+    return LIBRARY_SUFFIXES.get(SYSTEMS.get(sys.platform, ""), ".so")
 
 
 def signals_of(kind: str, variables: Sequence[Variable], prefix: str = "", per_second: bool = False) -> Signals:

@@ -1,4 +1,4 @@
-"""The door to fmpy: what an FMU says of itself, and one interface to its instances for FMI 2.0 and 3.0."""
+"""The door to fmpy: one interface to instances of FMUs, FMI 2.0 and 3.0."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +24,7 @@ from ctmhe.errors import (
     FmuUnsupportedError,
     MissingExtra,
 )
-from ctmhe.models.fmu.description import CO_SIMULATION, MODEL_EXCHANGE, Description, Interface, Variable
+from ctmhe.models.fmu.description import CO_SIMULATION, MODEL_EXCHANGE, Description, Variable
 from ctmhe.models.fmu.messages import callbacks2, listener3
 from ctmhe.types import Array
 
@@ -45,110 +44,6 @@ def _fmpy() -> Any:
     except ImportError as error:
         raise MissingExtra("fmpy", "fmu", "reading an FMU") from error
     return fmpy
-
-
-def read_description(folder: Path) -> Description:
-    """Read modelDescription.xml of an unpacked FMU.
-
-    Raises
-    ------
-    FmuError
-        If it cannot be parsed, or the FMI version is neither 2 nor 3.
-    """
-    fmpy = _fmpy()
-    try:
-        root = ElementTree.parse(folder / "modelDescription.xml").getroot()
-    except (ElementTree.ParseError, OSError, ValueError) as error:
-        raise FmuError(f"modelDescription.xml cannot be parsed: {error}; export the FMU again") from error
-    version = root.get("fmiVersion", "")
-    if version != "2.0" and not version.startswith("3."):
-        raise FmuError(f"FMI version {version or 'unknown'!r} is not supported; export the FMU as FMI 2.0 or 3.0")
-    try:
-        raw = fmpy.read_model_description(str(folder), validate=False)
-        return _description(raw, root)
-    except FmuError:
-        raise
-    except Exception as error:
-        raise FmuError(f"modelDescription.xml is inconsistent: {type(error).__name__}: {error}") from error
-
-
-def _description(raw: Any, root: ElementTree.Element) -> Description:
-    variables: dict[str, Variable] = {}
-    unsupported: dict[str, str] = {}
-    for variable in raw.modelVariables:
-        if variable.causality == "structuralParameter":
-            unsupported[variable.name] = "a structural parameter"
-        elif variable.dimensions:
-            unsupported[variable.name] = "an array"
-        elif variable.type in {"Real", "Float64"}:
-            variables[variable.name] = _variable(variable)
-    derivatives = [unknown.variable for unknown in raw.derivatives if unknown.variable.name in variables]
-    for variable in derivatives:
-        if variable.derivative is None:
-            raise FmuError(f"{variable.name!r} is listed as a derivative but does not say of which state")
-    own = [variables[v.name] for v in raw.modelVariables if v.name in variables and v.alias is None]
-    kinds = {}
-    for kind, interface in ((MODEL_EXCHANGE, raw.modelExchange), (CO_SIMULATION, raw.coSimulation)):
-        element = root.find(kind)
-        if interface is not None and element is not None:
-            kinds[kind] = _interface(interface, element)
-    experiment = raw.defaultExperiment
-    return Description(
-        version=raw.fmiVersion,
-        name=raw.modelName or "",
-        tool=raw.generationTool or "",
-        token=raw.guid or "",
-        kinds=kinds,
-        variables=variables,
-        states=tuple(variables[v.derivative.name] for v in derivatives),
-        derivatives=tuple(variables[v.name] for v in derivatives),
-        inputs=tuple(v for v in own if v.causality == "input"),
-        outputs=tuple(v for v in own if v.causality == "output"),
-        parameters=tuple(v for v in own if v.causality == "parameter" and v.variability in {"fixed", "tunable"}),
-        event_indicators=raw.numberOfEventIndicators,
-        unsupported=unsupported,
-        step=_number(experiment.stepSize) if experiment else None,
-        tolerance=_number(experiment.tolerance) if experiment else None,
-    )
-
-
-def _variable(raw: Any) -> Variable:
-    declared = raw.declaredType
-    nominal = _number(raw.nominal if raw.nominal is not None else getattr(declared, "nominal", None))
-    if nominal is not None and not (np.isfinite(nominal) and nominal != 0):
-        log.warning("%s: nominal value %s is of no use, 1 is taken", raw.name, nominal)
-        nominal = None
-    return Variable(
-        name=raw.name,
-        reference=int(raw.valueReference),
-        causality=raw.causality or "local",
-        variability=raw.variability or "continuous",
-        initial=raw.initial,
-        unit=raw.unit or getattr(declared, "unit", None) or "",
-        nominal=1.0 if nominal is None else abs(nominal),
-        start=_number(raw.start),
-        minimum=_number(raw.min if raw.min is not None else getattr(declared, "min", None)),
-        maximum=_number(raw.max if raw.max is not None else getattr(declared, "max", None)),
-    )
-
-
-def _number(text: Any) -> float | None:
-    return None if text is None else float(text)
-
-
-def _interface(raw: Any, element: ElementTree.Element) -> Interface:
-    # fmpy 0.3.32 looks for FMI 2's attribute only and so misses the plural of FMI 3: read the XML
-    told = (element.get("providesDirectionalDerivative"), element.get("providesDirectionalDerivatives"))
-    return Interface(
-        identifier=raw.modelIdentifier or "",
-        directional_derivatives=any(value in {"true", "1"} for value in told),
-        get_set_state=bool(raw.canGetAndSetFMUstate),
-        single_instance=bool(raw.canBeInstantiatedOnlyOncePerProcess),
-        completed_step=bool(getattr(raw, "needsCompletedIntegratorStep", False)),
-        variable_step=bool(getattr(raw, "canHandleVariableCommunicationStepSize", True)),
-        event_mode=element.get("hasEventMode") in {"true", "1"},
-        input_derivatives=element.get("canInterpolateInputs") in {"true", "1"},
-    )
 
 
 class Discard(FmuError):

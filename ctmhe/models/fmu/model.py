@@ -12,7 +12,7 @@ from ctmhe.errors import FmuError, InputError
 from ctmhe.models.fmu.archive import Unpacked
 from ctmhe.models.fmu.description import CO_SIMULATION, MODEL_EXCHANGE, Description, Variable, signals_of
 from ctmhe.models.fmu.functions import FmuFunctions
-from ctmhe.models.fmu.instance import read_description
+from ctmhe.models.fmu.reading import read_description
 from ctmhe.models.fmu.truth import Choice, Reference, check
 from ctmhe.models.signals import Signals
 from ctmhe.types import Bounds, frozen
@@ -203,10 +203,10 @@ def start_values(about: Description, start: Mapping[str, float]) -> dict[str, fl
     """Return checked start values by name."""
     known = tuple(v for v in about.variables.values() if v.settable or v in about.states)
     values = {}
-    for variable, value in zip(about.select("start value", list(start), known), start.values(), strict=True):
+    for name, value in start.items():
         if not np.isfinite(value):
-            raise InputError(f"start: {variable.name!r} is {value}, not finite")
-        values[variable.name] = float(value)
+            raise InputError(f"start: {name!r} is {value}, not finite")
+        values |= {variable.name: float(value) for variable in about.select("start value", name, known)}
     return values
 
 
@@ -220,38 +220,3 @@ def disturbance_signals(disturbed: Sequence[Variable], noisy: Sequence[Variable]
 def incidence(rows: Sequence[Variable], columns: Sequence[Variable]) -> np.ndarray:
     """Return the matrix (rows, columns) with 1 where both are the same variable."""
     return np.array([[float(row.name == column.name) for column in columns] for row in rows]).reshape(len(rows), -1)
-
-
-def describe(path: str | Path) -> str:
-    """Return what an FMU says of itself, as text for a person: version, kinds, signals with units and start values."""
-    archive = Unpacked(path)
-    try:
-        found = read_description(archive.folder)
-    finally:
-        archive.close()
-    flags = {
-        "directional derivatives": "directional_derivatives",
-        "get/set state": "get_set_state",
-        "one instance a process": "single_instance",
-    }
-    lines = [f"{found.name}: FMI {found.version}, made by {found.tool or 'an unnamed tool'}"]
-    for kind, interface in found.kinds.items():
-        offers = [label for label, field in flags.items() if getattr(interface, field)]
-        lines.append(f"  {kind}: {', '.join(offers) or 'nothing optional'}")
-    lines.append(f"  event indicators: {found.event_indicators}")
-    for title, variables in (
-        ("states", found.states),
-        ("inputs", found.inputs),
-        ("outputs", found.outputs),
-        ("parameters", found.parameters),
-    ):
-        lines.append(f"{title} ({len(variables)})" + ("" if variables else ": none"))
-        width = max((len(variable.name) for variable in variables), default=0)
-        for variable in variables:
-            unit = f" [{variable.unit}]" if variable.unit else ""
-            start = "" if variable.start is None else f" = {variable.start:g}"
-            kind = f", {variable.variability}" if title == "parameters" else ""
-            lines.append(f"  {variable.name:<{width}}{start}{unit}{kind}")
-    for name, reason in found.unsupported.items():
-        lines.append(f"not usable: {name} ({reason})")
-    return "\n".join(lines)
