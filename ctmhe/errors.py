@@ -52,11 +52,11 @@ class FmuBinaryError(FmuError):
 
 
 class FmuUnsupportedError(FmuError):
-    """The FMU needs what is not supported: arrays, structural parameters, no continuous states, no outputs."""
+    """The FMU needs what is not supported, or lacks what is needed: arrays; no states, outputs or way back in time."""
 
 
 class FmuEventError(FmuError):
-    """The FMU has events, and an estimator was not allowed to freeze them."""
+    """Events that an estimator was not allowed to freeze, that accumulate in a plant, or that end its simulation."""
 
 
 class FmuParameterError(FmuError):

@@ -9,21 +9,28 @@ from typing import Any
 
 import numpy as np
 
-from ctmhe.errors import FmuError, InputError
+from ctmhe.errors import FmuError, FmuKindError, FmuUnsupportedError, InputError
 from ctmhe.models.fmu.archive import Unpacked
 from ctmhe.models.fmu.description import CO_SIMULATION, MODEL_EXCHANGE, Description, Variable, signals_of
 from ctmhe.models.fmu.reading import read_description
 from ctmhe.models.signals import Signals
-from ctmhe.simulation._fmu_engines import CoSimulation, Engine, ModelExchange
+from ctmhe.simulation._fmu_engines import Engine, Setup
+from ctmhe.simulation._fmu_isolated import Isolated
 from ctmhe.types import Array, Values, finite_time, frozen
 
 
 class FmuPlant:
     """A plant that is an FMU.
 
-    Model exchange is integrated here, at tight tolerances, with state and time events located and handled; step
-    events are asked for at the end of every `advance`. In co-simulation the FMU integrates itself: an input that
-    varies is held over each communication step at its value in the middle, an error of second order in `step`.
+    Model exchange is integrated here, at tight tolerances: state events are located, time events hit, and an FMU that
+    wants to hear of integration steps hears of every accepted one and may ask for an event. In co-simulation the FMU
+    integrates itself: an input that varies is held over each communication step at its value in the middle, an error
+    of second order in `step`; FMUs of FMI 2 that take the slopes of inputs get them instead. FMI 3's event mode and
+    early return are used where offered.
+
+    An error of the FMU leaves the plant usable: at the last time that it reached where the message says so, and in any
+    case for `start`. A plant can be pickled; its copy is built anew from the file, which must not have changed, and
+    stands at its start.
 
     Parameters
     ----------
@@ -45,6 +52,10 @@ class FmuPlant:
         every `advance`, a varying one at least ten.
     rtol, atol : float
         Tolerances of the integration (model exchange); `atol` is multiplied by the states' nominals.
+    isolated : bool
+        Run the FMU in a process of its own. A crash or a hang is then an `FmuBinaryError`, and `start` begins again.
+    timeout : float or None
+        Seconds within which an isolated FMU has to answer a call; None: any time.
 
     Attributes
     ----------
@@ -58,8 +69,14 @@ class FmuPlant:
 
     Raises
     ------
+    FmuKindError
+        If the FMU does not offer `kind`.
+    FmuBinaryError
+        If its binary cannot be loaded or initialized.
+    FmuUnsupportedError
+        If states are to be disturbed in co-simulation.
     FmuError
-        If the FMU cannot be unpacked, read, loaded or initialized, or does not offer `kind`.
+        If it cannot be unpacked or read.
     InputError
         If a name is unknown; the message suggests the nearest.
     """
@@ -77,9 +94,12 @@ class FmuPlant:
         step: float | None = None,
         rtol: float = 1e-10,
         atol: float = 1e-12,
+        isolated: bool = False,
+        timeout: float | None = 60.0,
     ):
-        if step is not None and not (np.isfinite(step) and step > 0):
-            raise InputError(f"FmuPlant: step must be a positive number of seconds, got {step}")
+        for name, value in {"step": step, "timeout": timeout, "rtol": rtol, "atol": atol}.items():
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise InputError(f"FmuPlant: {name} must be a positive number, got {value}")
         self._archive = Unpacked(path)
         self.path = self._archive.path
         self._engine: Engine | None = None
@@ -91,12 +111,22 @@ class FmuPlant:
             self._parameters = plant_parameters(about, parameters or {})
             self.p = signals_of("parameter", [about.variables[name] for name in self._parameters])
             driven = (*self._inputs, *self._driven)
-            if self.kind == MODEL_EXCHANGE:
-                sizes = np.array([state.nominal for state in about.states])
-                self._engine = ModelExchange(about, self._archive.folder, driven, rtol, atol * sizes)
-            else:
-                self._engine = CoSimulation(about, self._archive.folder, driven, step)
+            setup = Setup(self.kind, about, self._archive.folder, driven, step, rtol, atol)
+            self._engine = Isolated(setup, timeout) if isolated else setup.engine()
             self.integrator = self._engine.method
+            self._arguments: dict[str, Any] = {
+                "kind": self.kind,
+                "inputs": list(self.u.names),
+                "outputs": list(self.y.names),
+                "states": list(self.x.names),
+                "disturbances": [variable.name for variable in self._disturbed],
+                "parameters": dict(self._parameters),
+                "step": step,
+                "rtol": rtol,
+                "atol": atol,
+                "isolated": isolated,
+                "timeout": timeout,
+            }
             self.start(0.0, None)
             self.x_start = frozen(self.state())
             self.u_start = frozen([variable.start or 0.0 for variable in self._inputs])
@@ -116,7 +146,9 @@ class FmuPlant:
         if disturbances is None:
             disturbances = [state.name for state in about.states] if exchange else []
         known = {v.name: v for v in (*about.inputs, *(about.states if exchange else ()))}
-        disturbed = about.select(
+        if not exchange:
+            refuse_state_kicks(about, disturbances)
+        self._disturbed = disturbed = about.select(
             "disturbance (an input, or a state of model exchange)", disturbances, tuple(known.values())
         )
         if inputs is None:
@@ -206,17 +238,45 @@ class FmuPlant:
         return np.concatenate([u, w[self._driven_at]])
 
     def state(self) -> Array:
-        """Return the true state now (nx,)."""
-        return self.engine.get(self._states, self._now)
+        """Return the true state now (nx,).
+
+        Raises
+        ------
+        FmuError
+            If the FMU says that it is not finite.
+        """
+        return self._read(self._states, self._now)
 
     def output(self, u: Array, w: Array) -> Array:
-        """Return the outputs now (ny,), with inputs `u` (nu,) and disturbance `w` (nw,)."""
+        """Return the outputs now (ny,), with inputs `u` (nu,) and disturbance `w` (nw,).
+
+        Raises
+        ------
+        FmuError
+            If the FMU says that one is not finite; NaN would be taken for a missing measurement.
+        """
         disturbance = self.w.vector(w, "FmuPlant.output")
-        values = self.engine.get(self._outputs, self._drive(self.u.vector(u, "FmuPlant.output"), disturbance))
+        values = self._read(self._outputs, self._drive(self.u.vector(u, "FmuPlant.output"), disturbance))
         return values + disturbance[self._push.shape[1] :]
 
+    def _read(self, variables: Sequence[Variable], inputs: Array) -> Array:
+        values = self.engine.get(variables, inputs)
+        if not np.isfinite(values).all():
+            wrong = [f"{v.name} = {x}" for v, x in zip(variables, values.tolist(), strict=True) if not np.isfinite(x)]
+            raise FmuError(
+                f"{self.name}: {', '.join(wrong)} at t = {self.engine.t:.9g}; restore a checkpoint, or start "
+                "again with other values"
+            )
+        return values
+
     def checkpoint(self) -> object:
-        """Return where the plant is, for `restore`."""
+        """Return where the plant is, for `restore`; what it keeps is freed with the object.
+
+        Raises
+        ------
+        FmuUnsupportedError
+            If the FMU cannot save its state and cannot do without (co-simulation, events).
+        """
         return self.engine.checkpoint(), self._now
 
     def restore(self, checkpoint: Any) -> None:
@@ -225,10 +285,13 @@ class FmuPlant:
         Raises
         ------
         FmuError
-            If the FMU cannot save its state and cannot do without (co-simulation, events).
+            If it is a checkpoint of another run.
         """
         place, self._now = checkpoint
         self.engine.restore(place)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return rebuilt, (self.path, self._archive.digest, self._arguments)
 
     def close(self) -> None:
         """Free the FMU and remove its temporary folder; safe to call twice."""
@@ -250,14 +313,35 @@ class FmuPlant:
 
 
 def chosen_kind(about: Description, kind: str | None) -> str:
-    """Return the kind to use, or raise `FmuError` when the FMU does not offer it."""
+    """Return the kind to use, or raise `FmuKindError` when the FMU does not offer it."""
     if kind is None:
         kind = MODEL_EXCHANGE if MODEL_EXCHANGE in about.kinds else CO_SIMULATION
     if kind not in {MODEL_EXCHANGE, CO_SIMULATION}:
         raise InputError(f"FmuPlant: kind must be {MODEL_EXCHANGE!r} or {CO_SIMULATION!r}, got {kind!r}")
     if kind not in about.kinds:
-        raise FmuError(f"{about.name} does not offer {kind}; it offers {', '.join(about.kinds) or 'neither kind'}")
+        raise FmuKindError(f"{about.name} does not offer {kind}; it offers {', '.join(about.kinds) or 'neither kind'}")
     return kind
+
+
+def refuse_state_kicks(about: Description, disturbances: Sequence[str]) -> None:
+    """Raise `FmuUnsupportedError` when states are to be disturbed in co-simulation."""
+    inputs = {variable.name for variable in about.inputs}
+    for state in about.states:
+        if state.name in disturbances and state.name not in inputs:
+            raise FmuUnsupportedError(
+                f"{about.name}: state {state.name!r} cannot be disturbed in co-simulation, where the FMU integrates "
+                "its states itself and FMI lets nobody set them after the initialization. Give the model an input "
+                f"that is added to der({state.name}), or use kind={MODEL_EXCHANGE!r}"
+            )
+
+
+def rebuilt(path: Path, digest: str, arguments: Mapping[str, Any]) -> FmuPlant:
+    """Return a plant that was pickled, from the file that it was made of."""
+    plant = FmuPlant(path, **arguments)
+    if plant._archive.digest != digest:
+        plant.close()
+        raise FmuError(f"{path} has changed since the plant was pickled; build the plant from the new file")
+    return plant
 
 
 def plant_parameters(about: Description, values: Mapping[str, float]) -> dict[str, float]:

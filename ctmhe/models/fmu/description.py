@@ -49,7 +49,8 @@ class Interface:
     """What an FMU offers as one kind (model exchange or co-simulation).
 
     `event_mode`, `early_return` and `fixed_step` (seconds, None where not stated) are of FMI 3 co-simulation;
-    `needs_tool` says that the binary only calls the tool that made it.
+    `input_derivatives` (inputs that change linearly over a step) is of FMI 2 co-simulation; `needs_tool` says that
+    the binary only calls the tool that made it.
     """
 
     identifier: str
@@ -62,6 +63,7 @@ class Interface:
     event_mode: bool = False
     early_return: bool = False
     fixed_step: float | None = None
+    input_derivatives: bool = False
 
 
 @dataclass(frozen=True)

@@ -5,24 +5,35 @@ from __future__ import annotations
 import ctypes
 import logging
 import os
-import platform
-import sys
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ctmhe.errors import FmuError, MissingExtra
+from ctmhe.errors import (
+    FmuBinaryError,
+    FmuError,
+    FmuEventError,
+    FmuKindError,
+    FmuParameterError,
+    FmuUnsupportedError,
+    MissingExtra,
+)
 from ctmhe.models.fmu.description import CO_SIMULATION, MODEL_EXCHANGE, Description, Variable
+from ctmhe.models.fmu.messages import callbacks2, listener3
 from ctmhe.types import Array
 
 log = logging.getLogger(__name__)
+
+OK, DISCARD, ERROR, FATAL, PENDING = 0, 2, 3, 4, 5
+_STATUS = {DISCARD: "discard", ERROR: "error", FATAL: "fatal error", PENDING: "pending"}
+_TERMINATED, _LAST_TIME = 3, 2  # kinds of status that FMI 2 can be asked for after a discarded step
+MOST_ROUNDS = 1000  # of one event iteration
 
 
 def _fmpy() -> Any:
@@ -35,12 +46,36 @@ def _fmpy() -> Any:
     return fmpy
 
 
+class Discard(FmuError):
+    """The FMU cannot be evaluated at this point, but may be at another."""
+
+
 @dataclass(frozen=True)
 class Event:
     """What an event iteration left behind; `next_time` is infinite when no time event is planned."""
 
     states_changed: bool
+    nominals_changed: bool
     next_time: float
+
+
+@dataclass(frozen=True)
+class Step:
+    """How far a communication step came: the time reached, and whether an event waits there to be handled."""
+
+    t: float
+    event: bool
+
+
+@dataclass
+class _Life:
+    """What is freed in the end; shared with the finalizer, which must not hold the instance."""
+
+    fmu: Any
+    saved: dict[int, Any] = field(default_factory=dict)
+    running: bool = False  # initialized, and no call has failed since
+    failure: str = ""  # the error after which the FMU takes no calls but those that bring it back
+    fatal: bool = False  # not even to be freed
 
 
 class Instance:
@@ -48,6 +83,8 @@ class Instance:
 
     A fresh instance is initialized by `initialize`; then model exchange is in continuous-time mode, co-simulation
     ready to step. Vectors are float64 arrays in the order of the variables passed.
+
+    After an error of the FMU only `load` and `close` are possible, as the standard has it; after `Discard` all is.
 
     Parameters
     ----------
@@ -59,14 +96,18 @@ class Instance:
 
     Raises
     ------
+    FmuKindError
+        If the FMU does not offer `kind`.
+    FmuBinaryError
+        If the binary cannot be loaded or refuses.
     FmuError
-        If the binary cannot be loaded or refuses; any later failing call names itself and its variables.
+        From any later call that fails; it names the call, its variables and what the FMU said.
     """
 
     def __init__(self, description: Description, folder: Path, kind: str):
         fmpy = _fmpy()
         if kind not in description.kinds:
-            raise FmuError(f"{description.name} offers {', '.join(description.kinds) or 'nothing'}, not {kind}")
+            raise FmuKindError(f"{description.name} offers {', '.join(description.kinds) or 'nothing'}, not {kind}")
         self.description, self.kind = description, kind
         self.interface = description.kinds[kind]
         self.messages: deque[str] = deque(maxlen=5)
@@ -83,32 +124,48 @@ class Instance:
                 instanceName=description.name or "fmu",
             )
         except Exception as error:
-            raise FmuError(
+            raise FmuBinaryError(
                 f"the binary of {description.name} ({self.interface.identifier}) cannot be loaded: {error}. "
                 f"The FMU needs a binary for this platform ({fmpy.platform_tuple})"
             ) from error
         finally:
             os.chdir(here)  # fmpy steps into the FMU's folder and stays there when loading fails
         self._instantiate(fmpy)
-        self._saved: dict[int, Any] = {}
-        self._free = weakref.finalize(self, _release, self._fmu, self._saved)
+        self._life = _Life(self._fmu)
+        self._free = weakref.finalize(self, _release, self._life)
         self._nx, self._nz = len(description.states), description.event_indicators
         self._derivatives, self._indicators = (ctypes.c_double * self._nx)(), (ctypes.c_double * self._nz)()
+
+    @property
+    def event_mode(self) -> bool:
+        """Whether events are handled with us: always in model exchange, by choice in FMI 3 co-simulation."""
+        return self.kind == MODEL_EXCHANGE or (self._version > 2 and self.interface.event_mode)
+
+    @property
+    def failed(self) -> bool:
+        """Whether the FMU reported an error, after which only `load` and `close` are possible."""
+        return bool(self._life.failure)
 
     def _instantiate(self, fmpy: Any) -> None:
         options: dict[str, Any]
         if self._version == 2:
             options = {}
-            options["callbacks"], self._fmu.listener = _fmi2_callbacks(fmpy.fmi2, self.messages)
+            options["callbacks"], self._fmu.listener = callbacks2(fmpy.fmi2, self.messages)
         else:
-            options = {"logMessage": partial(_listen3, self.messages)}
+            options = {"logMessage": listener3(self.messages)}
+            if self.kind == CO_SIMULATION:
+                options |= {"eventModeUsed": self.event_mode, "earlyReturnAllowed": True}
         try:
             self._fmu.instantiate(**options)
         except Exception as error:
             self._fmu.freeLibrary()
-            raise FmuError(
-                f"{self.description.name} cannot be instantiated for {self.kind}{self._told()}. Its binary and "
-                "its modelDescription.xml may not belong together: export it again"
+            advice = (
+                "It allows one instance in a process: close the other one"
+                if self.interface.single_instance
+                else "Its binary and its modelDescription.xml may not belong together: export it again"
+            )
+            raise FmuBinaryError(
+                f"{self.description.name} cannot be instantiated for {self.kind}{self._told()}. {advice}"
             ) from error
 
     def _told(self) -> str:
@@ -117,53 +174,91 @@ class Instance:
     def _call(self, name: str, *arguments: Any, about: Iterable[str] = ()) -> Any:
         if not self._free.alive:
             raise FmuError(f"{self.description.name} is closed; start it again or build a new one")
+        if self._life.failure and (self._life.fatal or name not in {"setFMUState", "freeFMUState"}):
+            raise FmuError(f"{self._life.failure}. It takes no more calls: start it again")
+        self.messages.clear()
         try:
             return getattr(self._fmu, name)(*arguments)
         except Exception as error:
-            names = ", ".join(about)
-            what = f"{name} of {names}" if names else name
-            raise FmuError(f"{self.description.name}: {what} failed: {error}{self._told()}") from error
+            raise self._failure(name, error, about) from error
+
+    def _failure(self, call: str, error: Exception, about: Iterable[str]) -> FmuError:
+        names = ", ".join(about)
+        what = getattr(error, "function", call) + (f" of {names}" if names else "")
+        status = getattr(error, "status", ERROR if isinstance(error, OSError) else OK)
+        reason = _STATUS.get(status, str(error))
+        text = f"{self.description.name}: {what} failed: {reason}{self._told()}"
+        if status == DISCARD:
+            return Discard(text)
+        if status >= ERROR:
+            self._life.failure, self._life.fatal, self._life.running = text, status == FATAL, False
+        return FmuError(text)
 
     def initialize(self, t: float, values: Mapping[str, float], tolerance: float | None = None) -> Event:
-        """Initialize at time `t` with start values by name (inputs, parameters, settable states)."""
+        """Initialize at time `t` with start values by name (inputs, parameters, settable states).
+
+        Raises
+        ------
+        FmuParameterError
+            If the FMU refuses a start value.
+        FmuBinaryError
+            If it cannot be initialized with them.
+        """
         chosen = [self.description.variables[name] for name in values]
         numbers = list(values.values())
-        if self._version == 2:
+        try:
             self.set(chosen, numbers)
-            self._call("setupExperiment", tolerance, t)
-            self._call("enterInitializationMode")
-        else:
-            self.set(chosen, numbers)
-            self._call("enterInitializationMode", tolerance, t)
-        self._call("exitInitializationMode")
-        if self.kind == CO_SIMULATION:
-            return Event(False, np.inf)
-        return self._iterate()
+        except FmuError as error:
+            raise FmuParameterError(f"{error}. Leave these start values to the FMU") from error
+        try:
+            if self._version == 2:
+                self._call("setupExperiment", tolerance, t)
+                self._call("enterInitializationMode")
+            else:
+                self._call("enterInitializationMode", tolerance, t)
+            self._call("exitInitializationMode")
+        except FmuError as error:
+            raise FmuBinaryError(f"{error}. It cannot be initialized at t = {t:.9g} with these start values") from error
+        self._life.running = True
+        return self._iterate(t) if self.event_mode else Event(False, False, np.inf)
 
-    def event(self) -> Event:
-        """Enter event mode, iterate until nothing changes, and leave it again (model exchange)."""
+    def event(self, t: float, variables: Sequence[Variable] = (), values: ArrayLike = ()) -> Event:
+        """Enter event mode at time `t`, set variables there, iterate until nothing changes, and leave it again.
+
+        Raises
+        ------
+        FmuEventError
+            If the iteration does not end, or the FMU asks to end the simulation.
+        """
         self._call("enterEventMode")
-        return self._iterate()
+        self.set(variables, values)
+        return self._iterate(t)
 
-    def _iterate(self) -> Event:
+    def _iterate(self, t: float) -> Event:
         function = "newDiscreteStates" if self._version == 2 else "updateDiscreteStates"
-        changed, next_time = False, np.inf
-        for _ in range(1000):
-            needed, terminate, _, states, planned, when = self._call(function)
-            changed |= bool(states)
+        changed, rescaled, next_time = False, False, np.inf
+        for _ in range(MOST_ROUNDS):
+            needed, terminate, nominals, states, planned, when = self._call(function)
+            changed, rescaled = changed or bool(states), rescaled or bool(nominals)
             next_time = float(when) if planned else np.inf
             if terminate:
-                raise FmuError(f"{self.description.name} asks to end the simulation{self._told()}")
+                raise self._ended(t)
             if not needed:
-                self._call("enterContinuousTimeMode")
-                return Event(changed, next_time)
-        raise FmuError(f"{self.description.name}: the event iteration does not end (1000 rounds)")
+                self._call("enterContinuousTimeMode" if self.kind == MODEL_EXCHANGE else "enterStepMode")
+                return Event(changed, rescaled, next_time)
+        raise FmuEventError(
+            f"{self.description.name}: the event iteration at t = {t:.9g} does not end ({MOST_ROUNDS} rounds)"
+            f"{self._told()}. Its discrete equations have no solution there"
+        )
 
-    def completed_step(self) -> bool:
-        """Tell the FMU that an integration step ended; True when it asks for an event (model exchange)."""
-        enter, terminate = self._call("completedIntegratorStep")
+    def _ended(self, t: float) -> FmuEventError:
+        return FmuEventError(f"{self.description.name} asks to end the simulation at t = {t:.9g}{self._told()}")
+
+    def completed_step(self, t: float) -> bool:
+        """Tell the FMU that an integration step ended at `t`; True when it asks for an event (model exchange)."""
+        enter, terminate = self._call("completedIntegratorStep", not self.interface.get_set_state)
         if terminate:
-            raise FmuError(f"{self.description.name} asks to end the simulation{self._told()}")
+            raise self._ended(t)
         return bool(enter)
 
     def set(self, variables: Sequence[Variable], values: ArrayLike) -> None:
@@ -197,12 +292,22 @@ class Instance:
 
     def set_states(self, x: Array) -> None:
         """Set all continuous states (model exchange)."""
+        if not self._nx:
+            return  # some FMUs refuse an empty vector
         self._call("setContinuousStates", (ctypes.c_double * self._nx)(*x.tolist()), self._nx)
 
     def states(self) -> Array:
         """Return all continuous states (model exchange)."""
         buffer = (ctypes.c_double * self._nx)()
-        self._call("getContinuousStates", buffer, self._nx)
+        if self._nx:
+            self._call("getContinuousStates", buffer, self._nx)
+        return np.array(buffer[:], dtype=np.float64)
+
+    def nominals(self) -> Array:
+        """Return the present nominal values of the continuous states (model exchange)."""
+        buffer = (ctypes.c_double * self._nx)()
+        if self._nx:
+            self._call("getNominalsOfContinuousStates", buffer, self._nx)
         return np.array(buffer[:], dtype=np.float64)
 
     def derivatives(self) -> Array:
@@ -227,30 +332,91 @@ class Instance:
         names = (variable.name for variable in (*unknowns, *knowns))
         return np.array(self._call("getDirectionalDerivative", *arguments, about=names), dtype=np.float64)
 
-    def do_step(self, t: float, length: float) -> None:
-        """Advance a co-simulation from `t` by `length` seconds."""
-        answer = self._call("doStep", t, length)
-        if answer is not None and (answer[1] or abs(answer[3] - t - length) > 1e-9 * max(1.0, abs(t), length)):
+    def set_slopes(self, variables: Sequence[Variable], values: ArrayLike) -> None:
+        """Set the time derivatives of inputs over the next step (FMI 2, where `interface.input_derivatives`)."""
+        references = [variable.reference for variable in variables]
+        slopes = np.asarray(values, float).tolist()
+        names = (variable.name for variable in variables)
+        self._call("setRealInputDerivatives", references, [1] * len(references), slopes, about=names)
+
+    def do_step(self, t: float, length: float) -> Step:
+        """Advance a co-simulation from `t` by `length` seconds, or as far as it comes.
+
+        Raises
+        ------
+        Discard
+            If it does not come any further than `t`; a shorter step may succeed.
+        FmuEventError
+            If the FMU asks to end the simulation.
+        FmuUnsupportedError
+            If it goes on in the background, which it was not offered.
+        """
+        return self._step2(t, length) if self._version == 2 else self._step3(t, length)
+
+    def _step2(self, t: float, length: float) -> Step:
+        try:
+            self._call("doStep", t, length, not self.interface.get_set_state)
+        except Discard:
+            last = self._status("getRealStatus", _LAST_TIME)
+            reached = t if last is None else float(last)
+            if self._status("getBooleanStatus", _TERMINATED):
+                raise self._ended(reached) from None
+            if not t < reached <= t + length:
+                raise
+            return Step(reached, False)
+        except FmuError as error:
+            if getattr(error.__cause__, "status", OK) == PENDING:
+                raise FmuUnsupportedError(
+                    f"{self.description.name}: doStep goes on in the background although it was not offered to; "
+                    "export the FMU for synchronous steps"
+                ) from error
+            raise
+        return Step(t + length, False)
+
+    def _status(self, call: str, kind: int) -> Any:
+        try:
+            return self._call(call, kind)
+        except Discard:  # it does not know
+            return None
+
+    def _step3(self, t: float, length: float) -> Step:
+        event, terminate, early = ctypes.c_bool(), ctypes.c_bool(), ctypes.c_bool()
+        last = ctypes.c_double(t + length)
+        keep = ctypes.c_bool(not self.interface.get_set_state)
+        results = [ctypes.byref(value) for value in (event, terminate, early, last)]
+        discarded = False
+        try:
+            self._call("fmi3DoStep", self._fmu.component, t, length, keep, *results)
+        except Discard:
+            discarded = True
+            if not (terminate or t < last.value <= t + length):
+                raise
+        reached = last.value if early or discarded else t + length
+        if terminate:
+            raise self._ended(reached)
+        if not t <= reached <= t + length * (1.0 + 1e-9):
             raise FmuError(
-                f"{self.description.name}: the step from {t} by {length} s ended at {answer[3]}"
-                f"{', asking to end the simulation' if answer[1] else ''}{self._told()}"
+                f"{self.description.name}: the step from {t} by {length} s returned early and says that it ended at "
+                f"{reached}, which is outside of the step{self._told()}"
             )
+        return Step(reached, bool(event) and self.event_mode)
 
     def save(self) -> SavedState:
         """Return a copy of everything inside the FMU; needs `interface.get_set_state`."""
         pointer = self._call("getFMUState")
-        self._saved[id(pointer)] = pointer
+        self._life.saved[id(pointer)] = pointer
         return SavedState(self, pointer)
 
     def load(self, saved: SavedState) -> None:
-        """Bring the FMU back to a state that this very instance saved."""
-        if saved.owner() is not self or id(saved.pointer) not in self._saved:
+        """Bring the FMU back to a state that this very instance saved, also after an error."""
+        if saved.owner() is not self or id(saved.pointer) not in self._life.saved:
             raise FmuError(f"{self.description.name}: a saved state is only good for the run that saved it")
         self._call("setFMUState", saved.pointer)
+        self._life.failure = ""
 
     def forget(self, pointer: Any) -> None:
         """Free a saved state."""
-        if self._free.alive and self._saved.pop(id(pointer), None) is not None:
+        if self._free.alive and self._life.saved.pop(id(pointer), None) is not None and not self._life.fatal:
             self._call("freeFMUState", pointer)
 
     def close(self) -> None:
@@ -273,45 +439,15 @@ def _forget(owner: Callable[[], Instance | None], pointer: Any) -> None:
         instance.forget(pointer)
 
 
-def _release(fmu: Any, saved: dict[int, Any]) -> None:
+def _release(life: _Life) -> None:
+    if life.fatal:
+        return  # the standard forbids any further call
     try:
-        for pointer in saved.values():
-            fmu.freeFMUState(pointer)
-        saved.clear()
-        fmu.freeInstance()
+        if life.running:
+            life.fmu.terminate()
+        for pointer in life.saved.values():
+            life.fmu.freeFMUState(pointer)
+        life.saved.clear()
+        life.fmu.freeInstance()
     except Exception:
         log.debug("freeing an FMU failed", exc_info=True)
-
-
-def _listen(messages: deque[str], status: int, text: bytes | None) -> None:
-    message = (text or b"").decode("utf-8", "replace").strip()
-    log.debug("FMU message (status %s): %s", status, message)
-    if status != 0:
-        messages.append(message)
-
-
-def _listen3(messages: deque[str], environment: Any, status: int, category: bytes, text: bytes | None) -> None:
-    _listen(messages, status, text)
-
-
-def _fmi2_callbacks(fmi2: Any, messages: deque[str]) -> tuple[Any, Any]:
-    """Return fmpy's callback structure and what must be kept alive with it.
-
-    A message is a printf format with arguments, which a Python callback cannot walk through. fmpy's addLoggerProxy
-    does, but keeps one logger for the whole process. Most FMUs pass "%s" and one text; the calling conventions
-    (but Apple's on ARM) hand that over like an ordinary sixth argument.
-    """
-    apple = sys.platform == "darwin" and platform.machine() == "arm64"
-
-    def listen(environment: Any, name: bytes, status: int, category: bytes, text: bytes, extra: int | None) -> None:
-        if text == b"%s" and extra is not None and not apple:
-            text = ctypes.string_at(extra)
-        _listen(messages, status, text)
-
-    pointer, text = ctypes.c_void_p, ctypes.c_char_p
-    listener = ctypes.CFUNCTYPE(None, pointer, text, ctypes.c_int, text, text, pointer)(listen)
-    callbacks = fmi2.fmi2CallbackFunctions()
-    callbacks.logger = ctypes.cast(listener, fmi2.fmi2CallbackLoggerTYPE)
-    callbacks.allocateMemory = fmi2.defaultCallbacks.allocateMemory
-    callbacks.freeMemory = fmi2.defaultCallbacks.freeMemory
-    return callbacks, listener

@@ -144,6 +144,7 @@ def _interface(reader: Reader, major: int, kind: str) -> Interface:
         event_mode=reader.truth("hasEventMode"),
         early_return=reader.truth("mightReturnEarlyFromDoStep"),
         fixed_step=fixed,
+        input_derivatives=reader.truth("canInterpolateInputs"),
     )
 
 
