@@ -92,6 +92,17 @@ def fmu_info(path: Annotated[Path, typer.Argument(help="The FMU.")]) -> None:
     typer.echo(describe(path))
 
 
+@fmu_app.command("check")
+def fmu_check(paths: Annotated[list[Path], typer.Argument(help="FMUs.")]) -> None:
+    """Try FMUs as plants and as models of an estimator; exit code 1 when one is unusable."""
+    from ctmhe.simulation.fmu import check_fmu
+
+    found = [check_fmu(path) for path in paths]
+    typer.echo("\n\n".join(map(str, found)))
+    if any(checkup.verdict == "unusable" for checkup in found):
+        raise typer.Exit(1)
+
+
 @fmu_app.command("build")
 def fmu_build(
     path: Annotated[Path, typer.Argument(help="An FMU with C sources.")],

@@ -1,7 +1,7 @@
 """Plants, disturbances, channels, and the loop that runs them with a trigger and an estimator."""
 
 from ctmhe.simulation.channel import Channel, Delivery, Everything, Link, SingleSample, WholeSignal
-from ctmhe.simulation.fmu_plant import FmuPlant
+from ctmhe.simulation.fmu import Checkup, FmuPlant, check_fmu
 from ctmhe.simulation.loop import simulate
 from ctmhe.simulation.plants import MapPlant, OdePlant, Plant
 from ctmhe.simulation.replay import replay
@@ -10,6 +10,7 @@ from ctmhe.simulation.signals import Gaussian, Recorded, Uniform, Waveform
 
 __all__ = [
     "Channel",
+    "Checkup",
     "Delivery",
     "Everything",
     "FmuPlant",
@@ -24,6 +25,7 @@ __all__ = [
     "Uniform",
     "Waveform",
     "WholeSignal",
+    "check_fmu",
     "replay",
     "simulate",
 ]

@@ -364,7 +364,7 @@ def test_without_fmpy_the_message_names_the_extra(path, monkeypatch):
 
 def test_importing_the_model_does_not_import_fmpy():
     """The optional library is loaded when an FMU is read, not before."""
-    code = "import sys, ctmhe.models.fmu, ctmhe.simulation.fmu_plant; assert 'fmpy' not in sys.modules"
+    code = "import sys, ctmhe.models.fmu, ctmhe.simulation.fmu.plant; assert 'fmpy' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

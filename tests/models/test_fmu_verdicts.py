@@ -32,6 +32,7 @@ REFUSED = {
     "structural": (FmuUnsupportedError, "'dampers' is a structural parameter"),
 }
 WARNED = {
+    "zero_nominal": "nominal value 0 of 'angle' is of no use, 1 is taken",
     "wrong_dependencies": r"leave out: der\(rate\) on angle",
     "no_dependencies": "lists no `dependencies` of",
     "wrong_derivatives": "d der\\(rate\\) / d angle is 3.5.* and not -3.5",

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 pytest.importorskip("fmpy")
 
 from ctmhe.errors import FmuError
-from ctmhe.simulation.fmu_plant import FmuPlant
+from ctmhe.simulation.fmu.plant import FmuPlant
 from fmus.build import build
 from tests.simulation.paper import ERROR, Paper, Refusal
 

@@ -6,8 +6,8 @@ import pytest
 pytest.importorskip("fmpy")
 
 from ctmhe.errors import FmuBinaryError, FmuError, FmuKindError, FmuParameterError, FmuUnsupportedError
-from ctmhe.simulation import _fmu_integrators
-from ctmhe.simulation.fmu_plant import FmuPlant
+from ctmhe.simulation.fmu import _integrators as _fmu_integrators
+from ctmhe.simulation.fmu.plant import FmuPlant
 from fmus.build import build
 from tests.simulation.paper import DISCARD, ERROR, FATAL, Paper, Refusal
 

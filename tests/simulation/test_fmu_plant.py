@@ -14,8 +14,8 @@ from scipy.integrate import solve_ivp
 pytest.importorskip("fmpy")
 
 from ctmhe.errors import FmuError, InputError
-from ctmhe.simulation import _fmu_integrators
-from ctmhe.simulation.fmu_plant import FmuPlant
+from ctmhe.simulation.fmu import _integrators as _fmu_integrators
+from ctmhe.simulation.fmu.plant import FmuPlant
 from fmus.build import build
 
 K1, K2 = 0.2, 0.0064

@@ -12,7 +12,7 @@ pytest.importorskip("fmpy")
 
 from ctmhe import MHE, RK4, DiscountedCost, FmuModel, Gaussian, MaxInterval, SendOnDelta, SingleSample, simulate
 from ctmhe.errors import FmuBinaryError, FmuError, FmuEventError, InputError
-from ctmhe.simulation.fmu_plant import FmuPlant
+from ctmhe.simulation.fmu.plant import FmuPlant
 from fmus.build import build
 
 

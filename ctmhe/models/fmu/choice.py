@@ -19,6 +19,7 @@ from ctmhe.models.fmu.description import (
     platform_folder,
     signals_of,
 )
+from ctmhe.models.fmu.evaluators import Worker
 from ctmhe.models.fmu.functions import REACH
 from ctmhe.models.signals import Signals
 
@@ -230,6 +231,18 @@ def choose(
         noisy,
         start_values(about, start, chosen_states),
     )
+
+
+def probe(about: Description, folder: Path, kind: str, values: Mapping[str, float] | None = None) -> None:
+    """Load and initialize an FMU in a process of its own.
+
+    Raises
+    ------
+    FmuBinaryError
+        It crashes there, refuses, or hangs.
+    """
+    bare = Choice(about, kind, None, (), (), (), (), (), (), values or {})
+    Worker(bare.configuration(folder), []).close()
 
 
 def model_kind(about: Description, kind: str | None, step: float | None) -> str:

@@ -110,6 +110,8 @@ class Description:
     sources : mapping kind -> tuple of Sources
         Empty for an FMU without C files.
     description : str
+    remarks : tuple of str
+        What in it is of no use, and what is taken instead.
     """
 
     version: str
@@ -134,6 +136,7 @@ class Description:
     platforms: tuple[str, ...] = ()
     sources: Mapping[str, tuple[Sources, ...]] = field(default_factory=dict)
     description: str = ""
+    remarks: tuple[str, ...] = ()
 
     @property
     def major(self) -> int:

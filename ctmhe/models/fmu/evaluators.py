@@ -290,6 +290,14 @@ class Evaluators:
         self._local.evaluator = found
         return found
 
+    def release(self) -> None:
+        """Free this thread's, so that another thread can have the only instance."""
+        found: Evaluator | None = getattr(self._local, "evaluator", None)
+        if found is not None:
+            del self._local.evaluator
+            self._all.discard(found)
+            found.close()
+
     def close(self) -> None:
         """Free all."""
         self._closed = True

@@ -147,7 +147,7 @@ class FmuModel:
         self.p_start = frozen(values[nx + nv :])
         configuration = choice.configuration(folder, values[nx : nx + nv])
 
-        found: tuple[str, ...] = ()
+        found = tuple(f"{about.name}: {remark}" for remark in about.remarks)
         points: tuple[Point, ...] = ()
         if check != "off":
             start = Point(about.start_time or 0.0, self.x_start, self.u_start, self.p_start)
@@ -160,7 +160,7 @@ class FmuModel:
                 thorough=check == "full",
             )
             findings = examination.run()
-            configuration, found, points = findings.configuration, findings.warnings, findings.usable
+            configuration, found, points = findings.configuration, found + findings.warnings, findings.usable
         self.warnings = found
         differenced = configuration["differenced"], configuration["rows_differenced"]
         self.exact_derivatives = bool(configuration["directional"]) and not any(map(any, differenced))
@@ -170,6 +170,8 @@ class FmuModel:
         self._functions, self.dynamics, self.output = functions, functions.dynamics, functions.output
         if check == "full":
             same_when_mapped(self.name, self.dynamics, points, self.x.names, len(self.w))
+        if self.single_instance:
+            self._evaluators.release()
         for text in found:
             warnings.warn(text, FmuWarning, stacklevel=4)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import re
 import sys
@@ -24,8 +23,6 @@ from ctmhe.models.fmu.structure import (
     unsupported_variables,
 )
 from ctmhe.models.fmu.units import BASE, Unit
-
-log = logging.getLogger(__name__)
 
 INITIALS = {"exact", "approx", "calculated"}
 MAX_INDICATORS = 1_000_000  # FMI 2 states a number that nothing else in the file confirms
@@ -53,7 +50,8 @@ def read_description(folder: Path) -> Description:
     kinds = _kinds(root, major)
     raws = read_variables(root, major)
     structure = read_structure(root, major, raws)
-    variables, own = _reals(root, major, raws)
+    remarks: list[str] = []
+    variables, own = _reals(root, major, raws, remarks)
     states, derivatives, unsupported = dynamics(structure["derivatives"], major, raws)
     unsupported = unsupported_variables(raws, structure) | unsupported
     inputs = [raw for raw in own if raw.causality == "input"]
@@ -89,6 +87,7 @@ def read_description(folder: Path) -> Description:
         platforms=_platforms(folder),
         sources=read_sources(root, folder, major, kinds),
         description=top.text("description"),
+        remarks=tuple(remarks),
         **experiment,
     )
 
@@ -148,7 +147,7 @@ def _interface(reader: Reader, major: int, kind: str) -> Interface:
     )
 
 
-def _reals(root: Element, major: int, raws: Sequence[Raw]) -> tuple[dict[str, Variable], list[Raw]]:
+def _reals(root: Element, major: int, raws: Sequence[Raw], remarks: list[str]) -> tuple[dict[str, Variable], list[Raw]]:
     """Return real scalars by name, with the alias names of FMI 3, and those that are no such alias."""
     types = _types(root, major)
     variables: dict[str, Variable] = {}
@@ -160,7 +159,7 @@ def _reals(root: Element, major: int, raws: Sequence[Raw]) -> tuple[dict[str, Va
             raise raw.value.fail("declaredType", f"which is no type of {raw.type} variables")
         variable = None
         if raw.type == REAL[major] and not raw.array and raw.causality != "structuralParameter":
-            variable = _variable(raw, types.get(declared))
+            variable = _variable(raw, types.get(declared), remarks)
             own.append(raw)
         for name, text in _names(raw, major):
             if name in names:
@@ -198,14 +197,14 @@ def _fits(tag: str, type: str) -> bool:
     return tag.removesuffix("Type") == type
 
 
-def _variable(raw: Raw, declared: Reader | None) -> Variable:
+def _variable(raw: Raw, declared: Reader | None, remarks: list[str]) -> Variable:
     def number(attribute: str, *, nan: bool = False) -> float | None:
         own = raw.value.number(attribute, nan=nan)
         return declared.number(attribute, nan=nan) if own is None and declared is not None else own
 
     nominal = number("nominal", nan=True)
     if nominal is not None and not (math.isfinite(nominal) and nominal >= sys.float_info.min):
-        log.warning("%s: nominal value %s is of no use, 1 is taken", raw.name, nominal)
+        remarks.append(f"the nominal value {nominal:g} of {raw.name!r} is of no use, 1 is taken")
         nominal = None
     minimum, maximum = number("min"), number("max")
     if minimum is not None and maximum is not None and minimum > maximum:

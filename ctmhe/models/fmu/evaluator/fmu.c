@@ -122,7 +122,7 @@ static int initialize(fmu *m) {
   }
   if (CALL(OTHER, "fmiXExitInitializationMode", exit_initialization(m->fmu))) return 1;
   if (!c->co_simulation) return iterate_events(m);
-  return m->f.save ? CALL(OTHER, "fmiXGetFMUState", save(m->fmu, &m->origin)) : 0;
+  return c->step > 0.0 ? CALL(OTHER, "fmiXGetFMUState", save(m->fmu, &m->origin)) : 0;
 }
 
 static void discard_instance(fmu *m) {

@@ -11,11 +11,12 @@ import numpy as np
 
 from ctmhe.errors import FmuError, FmuKindError, FmuUnsupportedError, InputError
 from ctmhe.models.fmu.archive import Unpacked
+from ctmhe.models.fmu.choice import probe
 from ctmhe.models.fmu.description import CO_SIMULATION, MODEL_EXCHANGE, Description, Variable, signals_of
 from ctmhe.models.fmu.reading import read_description
 from ctmhe.models.signals import Signals
-from ctmhe.simulation._fmu_engines import Engine, Setup
-from ctmhe.simulation._fmu_isolated import Isolated
+from ctmhe.simulation.fmu._engines import Engine, Setup
+from ctmhe.simulation.fmu._isolated import Isolated
 from ctmhe.types import Array, Values, finite_time, frozen
 
 
@@ -111,6 +112,8 @@ class FmuPlant:
             self._parameters = plant_parameters(about, parameters or {})
             self.p = signals_of("parameter", [about.variables[name] for name in self._parameters])
             driven = (*self._inputs, *self._driven)
+            if not isolated:
+                probe(about, self._archive.folder, self.kind)
             setup = Setup(self.kind, about, self._archive.folder, driven, step, rtol, atol)
             self._engine = Isolated(setup, timeout) if isolated else setup.engine()
             self.integrator = self._engine.method

@@ -16,8 +16,8 @@ from typing import IO, Any
 
 from ctmhe.errors import FmuBinaryError, FmuError
 from ctmhe.models.fmu.description import Variable
-from ctmhe.simulation._fmu_engines import Setup
-from ctmhe.simulation._fmu_worker import HUNG
+from ctmhe.simulation.fmu._engines import Setup
+from ctmhe.simulation.fmu._worker import HUNG
 from ctmhe.types import Array
 
 PATIENCE = 5.0  # seconds until a process that should end is ended
@@ -56,7 +56,7 @@ class Isolated:
     def _launch(self) -> None:
         self._said = tempfile.TemporaryFile()  # noqa: SIM115  closed with the process
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
-        command = [sys.executable, "-c", "from ctmhe.simulation._fmu_worker import main; main()"]
+        command = [sys.executable, "-c", "from ctmhe.simulation.fmu._worker import main; main()"]
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(
             command, stdin=pipe, stdout=pipe, stderr=self._said, env=environment, start_new_session=True

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from ctmhe.models.fmu.description import MODEL_EXCHANGE, Description, Variable
-from ctmhe.simulation._fmu_cosimulation import CoSimulation
-from ctmhe.simulation._fmu_exchange import ModelExchange
+from ctmhe.simulation.fmu._cosimulation import CoSimulation
+from ctmhe.simulation.fmu._exchange import ModelExchange
 from ctmhe.types import Array
 
 

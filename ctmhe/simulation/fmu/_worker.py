@@ -14,7 +14,7 @@ import traceback
 from typing import Any, BinaryIO
 
 from ctmhe.errors import FmuError
-from ctmhe.simulation._fmu_engines import Setup
+from ctmhe.simulation.fmu._engines import Setup
 
 HUNG = 124  # exit code, as of the command timeout
 CHECKS = 20  # of the time limit within its length

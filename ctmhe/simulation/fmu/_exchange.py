@@ -10,8 +10,8 @@ import numpy as np
 from ctmhe.errors import FmuError, FmuEventError
 from ctmhe.models.fmu.description import MODEL_EXCHANGE, Description, Variable
 from ctmhe.models.fmu.instance import Discard, Event, Instance
-from ctmhe.simulation._fmu_integrators import IntegrationError, Integrator, integrator
-from ctmhe.simulation._fmu_runner import Checkpoint, Crowd, Runner, cannot_return
+from ctmhe.simulation.fmu._integrators import IntegrationError, Integrator, integrator
+from ctmhe.simulation.fmu._runner import Checkpoint, Crowd, Runner, cannot_return
 from ctmhe.types import Array
 
 LISTED = 6  # states that a message shows

@@ -10,7 +10,7 @@ import numpy as np
 from ctmhe.errors import FmuError, FmuEventError
 from ctmhe.models.fmu.description import CO_SIMULATION, Description, Variable
 from ctmhe.models.fmu.instance import Discard, Instance
-from ctmhe.simulation._fmu_runner import Checkpoint, Crowd, Runner, cannot_return
+from ctmhe.simulation.fmu._runner import Checkpoint, Crowd, Runner, cannot_return
 from ctmhe.types import Array
 
 SHORTEST = 2.0**-10  # of a communication step, when the FMU discards longer ones
