@@ -58,7 +58,7 @@ def read_description(folder: Path) -> Description:
     if major == 2:
         check_shared([*states, *inputs])
     indicators = top.whole("numberOfEventIndicators", MAX_INDICATORS) if major == 2 else len(structure["indicators"])
-    experiment = _experiment(root)
+    experiment = _experiment(root, remarks)
     return Description(
         version=version,
         name=top.required("modelName"),
@@ -256,7 +256,7 @@ def _units(root: Element) -> dict[str, Unit]:
     return units
 
 
-def _experiment(root: Element) -> dict[str, float | None]:
+def _experiment(root: Element, remarks: list[str]) -> dict[str, float | None]:
     """Return the default experiment; step and tolerance are None where they are of no use."""
     element = root.find("DefaultExperiment")
     reader = Reader(root if element is None else element, "DefaultExperiment")
@@ -265,7 +265,7 @@ def _experiment(root: Element) -> dict[str, float | None]:
     for key in ("step", "tolerance"):
         value = found[key]
         if value is not None and value <= 0:
-            log.warning("the default experiment's %s is %s, which is of no use", names[key], value)
+            remarks.append(f"the default experiment's {names[key]} {value:g} is of no use")
             found[key] = None
     return found
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ctmhe.errors import CtmheError, FmuError, FmuEventError, FmuParameterError
+from ctmhe.errors import CtmheError, FmuError, FmuEventError, FmuKindError, FmuParameterError
 from ctmhe.models.fmu import FmuModel
 from ctmhe.models.fmu.archive import Unpacked
 from ctmhe.models.fmu.choice import check_supported, probe
@@ -186,7 +186,7 @@ class _Examination:
                 self._row("derivatives", "refused", f"{type(second).__name__}: {second}")
                 return None
         except CtmheError as error:
-            self._refused("derivatives", error)
+            self._refused("model" if isinstance(error, FmuKindError) else "derivatives", error)
             return None
         if not frozen:
             self._row("events", *_step_events(about))
@@ -248,8 +248,8 @@ def _step_events(about: Description) -> tuple[str, str]:
         return "ok", "handled by the FMU"
     if about.kinds[MODEL_EXCHANGE].completed_step:
         return "note", (
-            "none declared; it wants to hear of integration steps (completedIntegratorStep): an estimator does not tell "
-            "it, a plant does"
+            "none declared; it wants to hear of integration steps (completedIntegratorStep): an estimator does not "
+            "tell it, a plant does"
         )
     return "ok", "none"
 
