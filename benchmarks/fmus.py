@@ -114,7 +114,7 @@ PROBLEMS = {
         lambda k: 0.02 * noise(k, 6),
         hover_speed() * np.array([1.01, 0.99, 1.02, 1.0]),
     ),
-    "van_der_pol": Problem(
+    "vdp": Problem(
         "van_der_pol",
         {"inputs": [], "start": {"mu": 100.0}},
         lambda: van_der_pol(mu=100.0, noise=False),
@@ -181,7 +181,7 @@ def race(problem: Problem, updates: int) -> dict[str, Runner]:
     models = {"Python": problem.python(), "FMI 2": problem.model(2), "FMI 3": problem.model(3)}
     pairs = [(kind, how) for kind in models for how in COMPILE]
     runners = {f"{kind}, {how}": Runner.of(problem, models[kind], COMPILE[how]) for kind, how in pairs}
-    runners[ISOLATED] = Runner.of(problem, problem.model(2, isolated=True), "auto")
+    runners[ISOLATED] = Runner.of(problem, problem.model(2, isolated=True), COMPILE["compiled"])
     first = "Python, not compiled"
     for k in tqdm(range(problem.intervals + updates), f"update {problem.fmu}", leave=False):
         t, y = k * problem.settings["interval"], problem.outputs(k)

@@ -213,8 +213,8 @@ def fmus(rows: Rows) -> list[str]:
     """Return the section on FMUs in the place of Python models."""
     lines = [
         "## FMUs", "",
-        "`python -m benchmarks.fmus`: one update with a Python model and with its FMU, taking turns; *compiled* and *not",
-        "compiled* are the core's. *Calls alone* are the FMI calls of that update, repeated without anything around them.",
+        "`python -m benchmarks.fmus`: one update with a Python model and with its FMU, taking turns. What is compiled",
+        "or not is the core. *Calls alone*: the FMI calls of that update, repeated without anything around them.",
         "", *asked(rows),
     ]  # fmt: skip
     return [*lines, ""]
