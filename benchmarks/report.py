@@ -1,6 +1,6 @@
 """Write docs/benchmarks.md and its plots from a run's rows: `python -m benchmarks.report FILE.json [--docs DIR]`.
 
-Beside the file, `starts.json` and `limits.json` give the sections of these benchmarks.
+Beside the file, `starts.json`, `limits.json` and `fmus.json` give the sections of these benchmarks.
 """
 
 from __future__ import annotations
@@ -205,13 +205,29 @@ def limits(rows: Rows) -> list[str]:
     lines = [
         "## Start-up, jumps, endurance, memory", "",
         "`python -m benchmarks.limits`, with what was asked for where something was.", "",
-        "| part | problem | what | value | at most |", "|---|---|---|---|---|",
     ]  # fmt: skip
+    return [*lines, *asked(rows), ""]
+
+
+def fmus(rows: Rows) -> list[str]:
+    """Return the section on FMUs in the place of Python models."""
+    lines = [
+        "## FMUs", "",
+        "`python -m benchmarks.fmus`: one update with a Python model and with its FMU, taking turns. What is compiled",
+        "or not is the core. *Calls alone*: the FMI calls of that update, repeated without anything around them.",
+        "", *asked(rows),
+    ]  # fmt: skip
+    return [*lines, ""]
+
+
+def asked(rows: Rows) -> list[str]:
+    """Return the lines of a table of values and what was asked for."""
+    lines = ["| part | problem | what | value | at most |", "|---|---|---|---|---|"]
     for row in rows:
         most = "" if row["target"] is None else f"{row['target']:g}"
         value = f"{row['value']:.3g}" if abs(row["value"]) < 1e5 else f"{row['value']:.0f}"
         lines.append(f"| {row['part']} | {row['problem']} | {row['what']} | {value} {row['unit']} | {most} |")
-    return [*lines, ""]
+    return lines
 
 
 def page(rows: Rows, docs: Path, beside: Path) -> Path:
@@ -238,7 +254,7 @@ def page(rows: Rows, docs: Path, beside: Path) -> Path:
             for fit in exponents(rows)
         ]
         lines += [""]
-    for name, section in (("starts", starts), ("limits", limits)):
+    for name, section in (("starts", starts), ("limits", limits), ("fmus", fmus)):
         if (beside / f"{name}.json").exists():
             lines += section(json.loads((beside / f"{name}.json").read_text()))
     lines += [

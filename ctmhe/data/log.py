@@ -233,7 +233,7 @@ class MeasurementLog:
         Parameters
         ----------
         frame : DataFrame
-            One row an instant. Datetime columns are read as seconds since the first row.
+            One row an instant. Dates, or texts of dates in ISO 8601, are read as seconds since the first row.
         outputs, inputs : names, or mapping signal name -> column name
         time : str
             The time column.
@@ -255,7 +255,7 @@ class MeasurementLog:
         for column in (time, *columns[0].values(), *columns[1].values()):
             if column not in frame.columns:
                 raise InputError(f"log: no column {column!r}. Columns: {', '.join(map(str, frame.columns))}")
-        stamps = frame[time]
+        stamps = _stamps(frame[time], time)
         if pd.api.types.is_datetime64_any_dtype(stamps):
             t = (stamps - stamps.iloc[0]).dt.total_seconds().to_numpy()
         else:
@@ -284,6 +284,22 @@ def _as_mapping(names: Sequence[str] | Mapping[str, str]) -> dict[str, str]:
     if isinstance(names, Mapping):
         return dict(names)
     return {name: name for name in ([names] if isinstance(names, str) else names)}
+
+
+def _stamps(column: Any, name: str) -> Any:
+    """Return a time column: texts that are not numbers, which is how CSV files hold dates, as dates."""
+    import pandas as pd
+
+    if pd.api.types.is_numeric_dtype(column) or pd.api.types.is_datetime64_any_dtype(column):
+        return column
+    if pd.to_numeric(column, errors="coerce").notna().any():
+        return column
+    try:
+        return pd.to_datetime(column, format="ISO8601", utc=True)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"log: time column {name!r} holds neither numbers nor dates like 2025-01-31 08:15:00: {error}"
+        ) from None
 
 
 def _numbers(column: Any, name: str) -> Array:

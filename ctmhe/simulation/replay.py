@@ -9,6 +9,9 @@ import numpy as np
 from ctmhe.data.log import MeasurementLog
 from ctmhe.errors import InputError
 from ctmhe.estimators.mhe import MHE
+from ctmhe.models.continuous import Model
+from ctmhe.models.fmu import FmuModel
+from ctmhe.models.fmu.units import conversion, instruction, known_unit
 from ctmhe.models.signals import Signals
 from ctmhe.simulation.channel import Channel, SingleSample, WholeSignal
 from ctmhe.simulation.engine import Loop
@@ -125,7 +128,8 @@ def replay(
     Raises
     ------
     InputError
-        For a log without the model's signals or without rows in the chosen span, and as `simulate`.
+        For a log without the model's signals, in other units than the model's where it states them, or without rows in
+        the chosen span; and as `simulate`.
     TriggerError
         As `simulate`.
     """
@@ -134,6 +138,7 @@ def replay(
     if len(times) < 2:
         raise InputError(f"replay: the log has {len(times)} rows between {low:g} and {high:g} s; at least 2 are needed")
     model = mhe.model
+    check_units(log, model)
     plant = RecordedPlant(log, model.y, model.u)
     columns = [log.inputs.index(name) for name in model.u]
     if channel is None:
@@ -152,3 +157,29 @@ def replay(
         sample_time=lambda: plant.record_time,
     )
     return loop.run(truth=None, p_true=None, guess=guess, p=p, progress=progress)
+
+
+def check_units(log: MeasurementLog, model: Model) -> None:
+    """Raise `InputError` when the log states a unit other than the model's; with the conversion to apply.
+
+    Two spellings of one unit are accepted, as far as an FMU or common use defines them. What the log does not state is
+    not checked.
+    """
+    stated, units = log.units or {}, model.description.units if isinstance(model, FmuModel) else {}
+    for signals in (model.y, model.u):
+        for name, unit in zip(signals.names, signals.units, strict=True):
+            given = stated.get(name)
+            if not given or not unit:
+                continue
+            change = conversion(units, given, unit)
+            if change is not None and not instruction(*change):
+                continue
+            told = f"log: {name!r} is in {given!r} but the model has {unit!r}"
+            if change is not None:
+                remedy = f"convert the column ({instruction(*change)})"
+            elif known_unit(units, given) and known_unit(units, unit):
+                raise InputError(f"{told}, and these measure different things; is it the right column?")
+            else:
+                unknown = unit if known_unit(units, given) else given
+                remedy = f"convert the column ({unknown!r} is defined nowhere, so the factor is yours to find)"
+            raise InputError(f"{told}; {remedy} and state units.{name} = {unit!r}")

@@ -13,8 +13,8 @@ from ctmhe.data.log import MeasurementLog
 from ctmhe.errors import InputError
 from ctmhe.estimators.mhe import MHE
 from ctmhe.models.fmu import FmuModel
-from ctmhe.models.fmu.units import conversion, instruction, known_unit
 from ctmhe.simulation import Everything, Run, SingleSample, WholeSignal, replay
+from ctmhe.simulation.replay import check_units
 from ctmhe.transcription import CVODES, RK4
 from ctmhe.triggers import Trigger
 from ctmhe.triggers.loading import build_trigger
@@ -118,31 +118,6 @@ def build_estimator(model: FmuModel, table: Mapping[str, Any], where: str) -> MH
         )
     except TypeError as error:
         raise InputError(f"{where}: table [estimator]: {error}") from None
-
-
-def check_units(log: MeasurementLog, model: FmuModel) -> None:
-    """Raise `InputError` when the log states a unit other than the FMU's; with the conversion to apply.
-
-    Two spellings of one unit are accepted, as far as the FMU or common use defines them.
-    """
-    stated, units = log.units or {}, model.description.units
-    for signals in (model.y, model.u):
-        for name, unit in zip(signals.names, signals.units, strict=True):
-            given = stated.get(name)
-            if not given or not unit:
-                continue
-            change = conversion(units, given, unit)
-            if change is not None and not instruction(*change):
-                continue
-            told = f"log: {name!r} is in {given!r} but the FMU has {unit!r}"
-            if change is not None:
-                remedy = f"convert the column ({instruction(*change)})"
-            elif known_unit(units, given) and known_unit(units, unit):
-                raise InputError(f"{told}, and these measure different things; is it the right column?")
-            else:
-                unknown = unit if known_unit(units, given) else given
-                remedy = f"convert the column ({unknown!r} is defined nowhere, so the factor is yours to find)"
-            raise InputError(f"{told}; {remedy} and state units.{name} = {unit!r}")
 
 
 def _box(value: Any) -> Any:

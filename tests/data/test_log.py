@@ -85,6 +85,18 @@ def test_bad_tables_are_refused_with_the_row(change, keywords, message):
         MeasurementLog.from_dataframe(frame().assign(**change), **({"outputs": ["p_bar"]} | keywords))
 
 
+def test_dates_in_a_csv_are_seconds_since_the_first_row(tmp_path):
+    """In ISO 8601, with or without parts of a second or a zone; a clock put back by an hour is no step back."""
+    path = tmp_path / "log.csv"
+    path.write_text("when,p\n2024-10-27T02:30:00+02:00,1\n2024-10-27T02:59:59.5+02:00,2\n2024-10-27T02:30:00+01:00,3\n")
+    np.testing.assert_array_equal(MeasurementLog.from_csv(path, outputs="p", time="when").t, [0.0, 1799.5, 3600.0])
+    path.write_text("when,p\n2025-01-13 00:00:00,1\n2025-01-13 00:04:03.25,2\n")
+    np.testing.assert_array_equal(MeasurementLog.from_csv(path, outputs="p", time="when").t, [0.0, 243.25])
+    path.write_text("when,p\nyesterday,1\ntoday,2\n")
+    with pytest.raises(InputError, match="'when' holds neither numbers nor dates like 2025-01-31 08:15:00"):
+        MeasurementLog.from_csv(path, outputs="p", time="when")
+
+
 def test_missing_and_damaged_files_are_input_errors(tmp_path):
     """No file; not a table."""
     with pytest.raises(InputError, match="no file"):

@@ -189,6 +189,19 @@ def test_silent_sensors_in_a_log_are_missing(mhe):
     np.testing.assert_allclose(result.sample_times, t[::2])
 
 
+def test_a_log_in_another_unit_than_the_models_is_refused(result, mhe):
+    """Where the log states units they are compared, for models of any kind; what is not stated is not."""
+    log = log_of(result)
+
+    def stating(**units):
+        given = MeasurementLog(log.t, log.y, log.outputs, log.u, log.inputs, units)
+        return replay(given, mhe, trigger=POLICY, guess=[0.0, 0.0])
+
+    np.testing.assert_array_equal(stating(sensor="m").sample_times, result.sample_times)
+    with pytest.raises(InputError, match="'force' is in 'kW' but the model has 'N'"):
+        stating(sensor="m", force="kW")
+
+
 def test_a_log_that_does_not_fit_is_refused(mhe):
     """Missing inputs, foreign outputs and empty spans."""
     t, y, u = np.arange(3.0), np.zeros((3, 1)), np.zeros((3, 1))

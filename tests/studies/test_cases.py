@@ -97,7 +97,7 @@ def test_a_policy_of_ones_own_replaces_the_configurations(files):
         ("horizon = 2.0", "horizn = 2.0", "unknown key 'horizn'; did you mean 'horizon'"),
         ("pA = 0.1\n", "pC = 0.1\n", "table [guess]: unknown key 'pC'"),
         ('pressure = "p_total"', 'pressure = "p"', "no column 'p'. Columns: time, p_total"),
-        ('units = { pressure = "bar" }', 'units = { pressure = "Pa" }', "is in 'Pa' but the FMU has 'bar'"),
+        ('units = { pressure = "bar" }', 'units = { pressure = "Pa" }', "is in 'Pa' but the model has 'bar'"),
         ('units = { pressure = "bar" }', 'units = { pressure = "Pa" }', "multiply by 1e-5"),
         ('units = { pressure = "bar" }', 'units = { pressure = "degC" }', "these measure different things"),
         ('units = { pressure = "bar" }', 'units = { pressure = "psi" }', "'psi' is defined nowhere"),
