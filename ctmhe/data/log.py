@@ -292,7 +292,7 @@ def _stamps(column: Any, name: str) -> Any:
 
     if pd.api.types.is_numeric_dtype(column) or pd.api.types.is_datetime64_any_dtype(column):
         return column
-    if pd.to_numeric(column, errors="coerce").notna().any():
+    if np.isfinite(np.asarray(pd.to_numeric(column, errors="coerce"), dtype=float)).any():
         return column
     try:
         return pd.to_datetime(column, format="ISO8601", utc=True)

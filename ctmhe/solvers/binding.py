@@ -156,7 +156,7 @@ class Functions:
     def _own(self, stage: StageFunction) -> Function:
         evaluator = stage.model.evaluator()  # pyright: ignore
         nx, ny, n = stage.nx, stage.ny, stage.nx + stage.nw + stage.np
-        work = np.zeros(3 * nx + 4 * (nx + ny) * n + nx * (nx + ny + 1))  # see core/own.h
+        work = np.zeros(3 * nx + 2 * (nx + ny) * n + 2 * nx * n)  # see core/own.h
         u = np.zeros(stage.nu + 1)
         self.kept += [evaluator, work, u]
         addresses = {"work": work.ctypes.data, "input": u.ctypes.data, "method": METHODS[stage.method or ""]}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -9,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 from ctmhe.models.continuous import Model
+from ctmhe.transcription.sensitivities import step_symbols, step_with_sensitivities
 from ctmhe.types import Array, positive
 
 ROUND_OFF = 1e-14
@@ -40,13 +42,6 @@ class Integrator(Protocol):
         y (ny, nodes + 1): outputs at the nodes (none unless `signal`), then at the step's end.
         """
         ...
-
-
-def step_symbols(model: Model, kind: Any) -> list[Any]:
-    """Return the symbols (t, h, x, w, p, u0, u1) of a step."""
-    sizes = {"t": 1, "h": 1, "x": len(model.x), "w": len(model.w), "p": len(model.p)}
-    sizes |= {"u0": len(model.u), "u1": len(model.u)}
-    return [kind.sym(name, size) for name, size in sizes.items()]
 
 
 def is_symbolic(model: Model) -> bool:
@@ -133,20 +128,23 @@ class CVODES:
 
     def trace(self, model: Model, signal: bool) -> ca.Function:
         """Return (t, h, x, w, p, u0, u1) -> (x_next, y): see `Integrator`."""
-        kind: Any = ca.SX if is_symbolic(model) else ca.MX
-        t, h, x, w, p, u0, u1 = step_symbols(model, kind)
-        s = kind.sym("s")
-        scale = ca.DM(np.asarray(model.x.nominal))
+        grid = [*self.nodes, 1.0] if signal else [1.0]
+        if not is_symbolic(model):
+            return step_with_sensitivities(model, grid, self._flow)
+        t, h, x, w, p, u0, u1 = step_symbols(model, ca.SX)
+        s, scale = ca.SX.sym("s"), ca.DM(np.asarray(model.x.nominal))
         parameters = ca.vertcat(t, h, w, p, u0, u1)
         rate = h * model.dynamics(t + s * h, x * scale, u0 + s * (u1 - u0), w, p) / scale
-        grid = [*self.nodes, 1.0] if signal else [1.0]
-        options = {"reltol": self.rtol, "abstol": self.atol, "max_num_steps": 10_000}
-        flow = ca.integrator("flow", "cvodes", {"x": x, "t": s, "p": parameters, "ode": rate}, 0.0, grid, options)
+        flow = self._flow({"x": x, "t": s, "p": parameters, "ode": rate}, grid)
         symbols = step_symbols(model, ca.MX)
         t, h, x, w, p, u0, u1 = symbols
         states = flow(x0=x / scale, p=ca.vertcat(t, h, w, p, u0, u1))["xf"]
         outputs = [model.output(t + c * h, states[:, i] * scale, u0 + c * (u1 - u0), w, p) for i, c in enumerate(grid)]
         return ca.Function("step", symbols, [states[:, -1] * scale, ca.horzcat(*outputs)])
+
+    def _flow(self, problem: dict[str, Any], grid: Sequence[float]) -> ca.Function:
+        options = {"reltol": self.rtol, "abstol": self.atol, "max_num_steps": 10_000}
+        return ca.integrator("flow", "cvodes", problem, 0.0, list(grid), options)
 
 
 @dataclass(frozen=True)
