@@ -144,8 +144,8 @@ print("directional derivatives:", model.exact_derivatives, "| warnings:", model.
 # discounted (`eta` = 1, the default), so that covariances can be taken at their word.
 #
 # The building is slow: its fastest time constant is above half an hour. One RK4 step of 15 min will do (checked below);
-# a stiffer FMU would get `CVODES()`. The window of three days spans the slowest time constant, 2.6 days with the
-# catalogue's values.
+# a stiff FMU would get `CVODES()`, which takes far longer. The window of three days spans the slowest time constant,
+# 2.6 days with the catalogue's values.
 
 
 # %%
