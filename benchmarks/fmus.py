@@ -35,7 +35,9 @@ from fmus.build import build
 
 REPEATS = 5
 LOADS = 7  # of every kind
-AGREEMENT = 1e-6  # relative, of the costs of all models: what the other benchmarks ask for too
+# standard deviations between the estimates of all models: each converges to the root of its tolerance, 3e-5, and goes
+# on from priors of its own, which were as near
+AGREEMENT = 1e-3
 MOST_RATIO, MOST_OVERHEAD = 5.0, 1.5  # FMU over Python model, neither compiled; update over its bare calls
 COMPILE = {"not compiled": "off", "compiled": "auto"}  # of the core: an FMU's own code stays as it is
 CHECKS = ("full", "fast", "off")
@@ -188,12 +190,13 @@ def race(problem: Problem, updates: int) -> dict[str, Runner]:
         for runner in runners.values():
             runner.state = runner.mhe.observe(runner.state, Measurement(t, y))
         found = estimate(runners, t, problem.repeats if k >= problem.intervals else 1)
+        std = np.sqrt(np.diag(found[first].covariance))
         for name, result in found.items():
             if not result.status.success:
                 raise SystemExit(f"{problem.fmu}, {name}: not solved at t = {t:g}: {result.status}")
-            cost = found[first].cost
-            if abs(result.cost - cost) > AGREEMENT * cost:
-                raise SystemExit(f"{problem.fmu}, {name}: cost {result.cost} at t = {t:g}, {first} has {cost}")
+            off = float(np.max(np.abs(result.x - found[first].x) / std))
+            if off > AGREEMENT:
+                raise SystemExit(f"{problem.fmu}, {name}: {off:.1e} standard deviations from {first} at t = {t:g}")
     for runner in runners.values():
         runner.seconds, runner.bare = runner.seconds[-updates:], runner.bare[-updates:]
         runner.calls = runner.calls[-updates * problem.repeats :]

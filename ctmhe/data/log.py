@@ -287,13 +287,15 @@ def _as_mapping(names: Sequence[str] | Mapping[str, str]) -> dict[str, str]:
 
 
 def _stamps(column: Any, name: str) -> Any:
-    """Return a time column: texts that are not numbers, which is how CSV files hold dates, as dates."""
+    """Return a time column, as dates where it holds texts of dates: CSV files know no other."""
     import pandas as pd
 
-    if pd.api.types.is_numeric_dtype(column) or pd.api.types.is_datetime64_any_dtype(column):
+    if pd.api.types.is_datetime64_any_dtype(column):
         return column
-    if np.isfinite(np.asarray(pd.to_numeric(column, errors="coerce"), dtype=float)).any():
-        return column
+    try:
+        return pd.to_numeric(column)
+    except (TypeError, ValueError):
+        pass  # no numbers: dates, or an error below
     try:
         return pd.to_datetime(column, format="ISO8601", utc=True)
     except (TypeError, ValueError) as error:
