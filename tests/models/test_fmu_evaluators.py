@@ -231,9 +231,10 @@ def test_a_binary_that_crashes_when_loaded_does_not_take_the_interpreter_along()
             FmuModel(build("crashes_at_load", fmi=fmi))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is read from /proc")
 def test_models_come_and_go_without_a_trace(tmp_path):
-    """Load, estimate, close, 150 times in a process of its own: memory levels off, no folder and no file stays open."""
+    """Load, estimate, close, 200 times in a process of its own: memory levels off, no folder and no file stays open."""
     code = f"""
 import gc, os, resource, tempfile
 tempfile.tempdir = {str(tmp_path)!r}
@@ -252,7 +253,7 @@ def cycle():
 def pages():
     gc.collect()
     return int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize()
-for _ in range(50): cycle()
+for _ in range(100): cycle()
 files, first = len(os.listdir("/proc/self/fd")), pages()
 for _ in range(100): cycle()
 print((pages() - first) / 100, len(os.listdir("/proc/self/fd")) - files, len(os.listdir({str(tmp_path)!r})))

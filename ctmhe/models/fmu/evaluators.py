@@ -142,6 +142,8 @@ class Evaluator:
     values : list of float
         Of `references`, after initialization.
     next_event : float
+    point : tuple of arrays (nx,), (nu,), (nw,), (np,)
+        Where `run` evaluates: x, u, w, p.
     """
 
     def __init__(self, configuration: dict[str, Any], references: list[int], seconds: float | None):
@@ -165,6 +167,8 @@ class Evaluator:
             away = (self._worker.back, self._worker.to, seconds, self._renew)
             self.pointer = self._library.ctmhe_fmu_remote(*self._sizes, *away)
             self._end = weakref.finalize(self, self._library.ctmhe_fmu_close, self.pointer)
+        self.point = tuple(np.zeros(size) for size in self._sizes[:4])
+        self._addresses = tuple(array.ctypes.data for array in self.point)
         self.address = ctypes.cast(self._library.ctmhe_fmu_evaluate, ctypes.c_void_p).value
 
     def evaluate(
@@ -178,12 +182,22 @@ class Evaluator:
             The FMU cannot be evaluated there; with the call, the point and its own words.
         """
         nx, _, nw, n_p, ny = self._sizes
-        given = [np.array(value, dtype=float) for value in (x, u, w, p)]
+        for own, value in zip(self.point, (x, u, w, p), strict=True):
+            own[:] = value
         dx, y, J = np.empty(nx), np.empty(ny), np.empty((nx + nw + n_p, nx + ny))
-        addresses = [array.ctypes.data for array in (*given, dx, y)]
-        if self._library.ctmhe_fmu_evaluate(self.pointer, t, *addresses, J.ctypes.data if jacobian else None):
-            raise FloatingPointError(self.message())
+        self.run(t, dx.ctypes.data, y.ctypes.data, J.ctypes.data if jacobian else None)
         return dx, y, J.T
+
+    def run(self, t: float, dx: int | None, y: int | None, J: int | None) -> None:
+        """Evaluate at `point`, the arrays x, u, w, p, into memory at these addresses: see `ctmhe_fmu_evaluate`.
+
+        Raises
+        ------
+        FloatingPointError
+            As for `evaluate`.
+        """
+        if self._library.ctmhe_fmu_evaluate(self.pointer, t, *self._addresses, dx, y, J):
+            raise FloatingPointError(self.message())
 
     def message(self) -> str:
         """Return what the last failure was."""
