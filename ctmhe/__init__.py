@@ -17,6 +17,7 @@ from ctmhe.simulation import (
     SingleSample,
     Uniform,
     WholeSignal,
+    check_fmu,
     replay,
     simulate,
 )
@@ -82,6 +83,7 @@ __all__ = [
     "TriggerError",
     "Uniform",
     "WholeSignal",
+    "check_fmu",
     "replay",
     "simulate",
     "trigger",

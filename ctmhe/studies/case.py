@@ -21,7 +21,20 @@ from ctmhe.triggers.loading import build_trigger
 from ctmhe.types import Bounds, DiscountedCost
 
 TABLES: dict[str, tuple[str, ...]] = {
-    "model": ("inputs", "outputs", "parameters", "disturbances", "output_noise", "start", "allow_frozen_events"),
+    "model": (
+        "kind",
+        "step",
+        "inputs",
+        "outputs",
+        "states",
+        "parameters",
+        "disturbances",
+        "output_noise",
+        "start",
+        "allow_frozen_events",
+        "check",
+        "isolated",
+    ),
     "log": ("time", "time_unit", "outputs", "inputs", "units"),
     "estimator": ("horizon", "interval", "integrator", "cost", "bounds", "hold", "hold_limit", "input_hold", "solver"),
     "guess": (),
@@ -105,17 +118,17 @@ def read_toml(path: Path) -> dict[str, Any]:
 def build_estimator(model: FmuModel, table: Mapping[str, Any], where: str) -> MHE:
     """Return the estimator that the table [estimator] describes."""
     options = dict(table)
-    for key in ("horizon", "interval"):
+    for key in ("horizon",) if model.step else ("horizon", "interval"):
         if key not in options:
             raise InputError(f"{where}: table [estimator] needs {key} (seconds)")
-    integrator = dict(options.pop("integrator", {"kind": "RK4", "step": options["interval"] / 5}))
-    kind = _choose(INTEGRATORS, integrator.pop("kind", None), "integrator kind")
     cost = dict(options.pop("cost", {}))
     bounds = {key: _box(value) for key, value in options.pop("bounds", {}).items()}
     try:
-        return MHE(
-            model, integrator=kind(**integrator), cost=DiscountedCost(**cost), bounds=Bounds(**bounds), **options
-        )
+        if not model.step:  # a step map has no integrator
+            integrator = dict(options.pop("integrator", {"kind": "RK4", "step": options["interval"] / 5}))
+            kind = _choose(INTEGRATORS, integrator.pop("kind", None), "integrator kind")
+            options["integrator"] = kind(**integrator)
+        return MHE(model, cost=DiscountedCost(**cost), bounds=Bounds(**bounds), **options)
     except TypeError as error:
         raise InputError(f"{where}: table [estimator]: {error}") from None
 

@@ -161,3 +161,24 @@ def test_the_demonstration_prints_and_writes_what_it_says(tmp_path):
     assert event.samples == periodic.samples
     assert f"{event.online_rms():.4f}" in result.output and f"{periodic.online_rms():.4f}" in result.output
     assert (tmp_path / "demo" / "estimates.png").stat().st_size > 10_000
+
+
+def test_a_co_simulation_fmu_is_estimated_as_a_step_map(files):
+    """The configuration names the step, and needs neither interval nor integrator; samples lie on the steps."""
+    folder, x = files
+    changes = {
+        "[model]": '[model]\nkind = "CoSimulation"\nstep = 0.02',
+        "interval = 0.1\n": "",
+        'integrator = { kind = "RK4", step = 0.05 }\n': "",
+        "R = 1e2": "R = 10",
+        "Q = 2e3": "Q = 1e7",
+        "eta = 0.4": "eta = 0.98",  # of a step
+    }
+    config = CONFIG
+    for old, new in changes.items():
+        config = config.replace(old, new)
+    (folder / "case.toml").write_text(config)
+    result = CliRunner().invoke(app, arguments(folder))
+    assert result.exit_code == 0, result.output + repr(result.exception)
+    run = Run.load(folder / "out" / "run.nc")
+    np.testing.assert_allclose(run.dataset["x_online"].values[-1], x[:, -1], atol=0.15)
