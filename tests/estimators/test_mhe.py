@@ -544,4 +544,5 @@ def test_cvodes_estimates_a_stiff_plant_where_rk4_of_equal_cost_cannot_even_pred
     plant.advance(70.0, nothing, nothing, w)
     np.testing.assert_allclose(mhe.predict(state, 70.0).x, plant.state(), atol=1e-4)
     explicit = MHE(model, integrator=RK4(0.05), **options)
-    assert not np.isfinite(explicit.propagate(explicit.init(x=truth), 60.0, 70.0, truth, model.p_start)).all()
+    ahead = explicit.propagate(explicit.init(x=truth), 60.0, 70.0, truth, model.p_start)  # of the FMU: held, it fails
+    assert not np.allclose(ahead, plant.state(), atol=0.01)

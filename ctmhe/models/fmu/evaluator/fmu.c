@@ -1,6 +1,7 @@
 /* Evaluators: see fmu.h. One evaluator serves one thread. */
 #define _POSIX_C_SOURCE 200809L /* pipes */
 #include "calls.h"
+#include "messages.h"
 
 #include <math.h>
 
@@ -45,16 +46,12 @@ static const char *const status_names[] = {"ok", "warning", "discard", "error", 
 
 static void listen2(void *environment, const char *name, int status, const char *category, const char *text, ...) {
   fmu *m = environment;
+  va_list rest;
   (void)name, (void)category;
   if (!m || !text || status == FMI_OK) return;
-  if (!strchr(text, '%')) {
-    snprintf(m->told, sizeof m->told, "%s", text);
-  } else {
-    va_list rest;
-    va_start(rest, text);
-    vsnprintf(m->told, sizeof m->told, text, rest);
-    va_end(rest);
-  }
+  va_start(rest, text);
+  write_message(m->told, sizeof m->told, text, rest);
+  va_end(rest);
 }
 
 static void listen3(void *environment, int status, const char *category, const char *text) {
@@ -397,6 +394,17 @@ static int failed(fmu *m) {
 /* ---- entry points ----------------------------------------------------------------------------------------------- */
 
 #include "remote.h"
+
+API void ctmhe_fmu_listen(void *ear, const char *name, int status, const char *category, const char *text, ...) {
+  char message[2048];
+  va_list rest;
+  (void)name, (void)category;
+  if (!ear || !text) return;
+  va_start(rest, text);
+  write_message(message, sizeof message, text, rest);
+  va_end(rest);
+  ((const ctmhe_fmu_ear *)ear)->hear(status, message);
+}
 
 API int ctmhe_fmu_version(void) { return CTMHE_FMU_VERSION; }
 

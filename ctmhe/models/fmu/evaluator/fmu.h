@@ -64,6 +64,12 @@ int ctmhe_fmu_serve(void *model, int in, int out);
 typedef int (*ctmhe_fmu_renew)(int *in, int *out);
 void *ctmhe_fmu_remote(int nx, int nu, int nw, int np, int ny, int in, int out, double seconds, ctmhe_fmu_renew renew);
 
+/* A logger for FMI 2: its environment is what hears the finished messages. */
+typedef struct {
+  void (*hear)(int status, const char *text);
+} ctmhe_fmu_ear;
+void ctmhe_fmu_listen(void *ear, const char *name, int status, const char *category, const char *text, ...);
+
 int ctmhe_fmu_version(void);
 
 #endif
