@@ -36,6 +36,7 @@ typedef struct {              /* arguments and results of one step, in that orde
   const double *arg[9];
   double *res[3];
   double t, h;
+  int inner;                  /* another step of the slot follows: the output at this one's end is not wanted */
 } ctmhe_call;
 
 /* The same for up to CTMHE_BATCH steps at once: what tape.py writes for models of scalar expressions. */

@@ -90,11 +90,14 @@ static int own_step(const ctmhe_stage *s, const ctmhe_function *f, const call *c
     if (nodes) hand_out(K, nx, ld, result, height, nx + stage * ny, n);
   }
   for (int i = 0; i < nx; i++) x_next[i] = x[i] + h * sum[i];
+  if (derivatives) {
+    shift(S, total, h, nx, n);
+    hand_out(S, 0, nx, result, height, 0, n);
+  }
+  if (c->inner) return 0;
   if (f->evaluate(f->model, t + h, x_next, u1, w, p, NULL, y + (points - 1) * ny, j)) return 1;
   if (!derivatives) return 0;
-  shift(S, total, h, nx, n);
   chain(J, S, K, ld, nx, n, nx, ld);
-  hand_out(S, 0, nx, result, height, 0, n);
   hand_out(K, nx, ld, result, height, nx + (points - 1) * ny, n);
   return 0;
 }

@@ -73,6 +73,7 @@ typedef struct {
 static void set_step(const ctmhe_stage *s, const slot_call *c, const workspace *k, call *one, int i, int steps) {
   const double length = c->h / steps, begin = (double)i / steps, end = (double)(i + 1) / steps;
   one->t = c->t + i * length;
+  one->inner = i + 1 < steps;
   one->h = length;
   for (int l = 0; l < s->nu; l++) {
     k->u0[l] = c->u0[l] + (c->u1[l] - c->u0[l]) * begin;
@@ -131,6 +132,7 @@ static int evaluate_slots(const ctmhe_stage *s, const ctmhe_function *f, const s
       double *res[3] = {c->x_next, c->y, c->J};
       memcpy(calls[l].arg, arg, sizeof arg);
       memcpy(calls[l].res, res, sizeof res);
+      calls[l].inner = 0;
     }
     return call_step(s, f, calls, lanes, results);
   }
@@ -165,7 +167,7 @@ static int slot_curvature(const ctmhe_stage *s, const slot_call *c, const double
   const int points = POINTS(s), inner = (points - 1) * ny, rows = nx + points * ny;
   double *H = memory;
   if (s->steps == 1) {
-    const call one = {{&c->t, &c->h, c->x, c->w, c->p, c->u0, c->u1, lambda_x, lambda_y}, {H, NULL, NULL}, 0.0, 0.0};
+    const call one = {{&c->t, &c->h, c->x, c->w, c->p, c->u0, c->u1, lambda_x, lambda_y}, {H, NULL, NULL}, 0.0, 0.0, 0};
     return call_step(s, &s->curvature, &one, 1, 1);
   }
   double *dual_x = H + n0 * n0, *dual_y = dual_x + nx, *step_H = dual_y + points * ny, *T = step_H + n0 * n0,
