@@ -23,6 +23,8 @@ def on_paper(monkeypatch, tmp_path) -> Callable[..., tuple[Path, SimpleNamespace
     import fmpy.fmi2
     import fmpy.fmi3
 
+    monkeypatch.setattr("ctmhe.simulation.fmu.plant.probe", lambda *_: None)  # paper has no binary
+
     def make(model: Paper, version: int = 2):
         journal = SimpleNamespace(alive=0, made=0, saved=0, events=[], steps=[])
         path = tmp_path / "paper.fmu"
