@@ -162,8 +162,10 @@ class FmuModel:
             findings = examination.run()
             configuration, found, points = findings.configuration, found + findings.warnings, findings.usable
         self.warnings = found
-        differenced = configuration["differenced"], configuration["rows_differenced"]
-        self.exact_derivatives = bool(configuration["directional"]) and not any(map(any, differenced))
+        asked = [True] * nx + [v in choice.disturbed for v in choice.driven] + [True] * len(choice.parameters)
+        differenced = [d and a for d, a in zip(configuration["differenced"], asked, strict=True)]
+        differenced += configuration["rows_differenced"]
+        self.exact_derivatives = bool(configuration["directional"]) and not any(differenced)
         self._evaluators = Evaluators(configuration, references, alone=self.single_instance, seconds=seconds)
         sizes = tuple(configuration[key] for key in ("nx", "nu", "nw", "np", "ny"))
         functions = FmuFunctions(self._evaluators, sizes, self.u.nominal)
@@ -173,7 +175,7 @@ class FmuModel:
         if self.single_instance:
             self._evaluators.release()
         for text in found:
-            warnings.warn(text, FmuWarning, stacklevel=4)
+            warnings.warn(text, FmuWarning, stacklevel=3)
 
     def evaluator(self) -> Evaluator:
         """Return this thread's evaluator, which solvers call without CasADi."""

@@ -24,6 +24,7 @@ from ctmhe.models.fmu.structure import (
 )
 from ctmhe.models.fmu.units import BASE, Unit
 
+COMPLAINTS = {f"logStatus{status}" for status in ("Warning", "Discard", "Error", "Fatal")}
 INITIALS = {"exact", "approx", "calculated"}
 MAX_INDICATORS = 1_000_000  # FMI 2 states a number that nothing else in the file confirms
 
@@ -87,6 +88,11 @@ def read_description(folder: Path) -> Description:
         platforms=_platforms(folder),
         sources=read_sources(root, folder, major, kinds),
         description=top.text("description"),
+        complaints=tuple(
+            element.get("name", "")
+            for element in root.findall("LogCategories/Category")
+            if element.get("name") in COMPLAINTS
+        ),
         remarks=tuple(remarks),
         **experiment,
     )
