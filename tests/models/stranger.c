@@ -7,6 +7,7 @@
  *   NO_VALUES          no value can be read
  *   PYTHON             it needs a module that the session can import
  *   ROUNDS_UP          it leaves another rounding mode, and traps on
+ *   TIRES              it discards every evaluation after the first 40 of an instance
  *   GOES_AWAY          it leaves another working directory */
 #define _GNU_SOURCE
 #include <fenv.h>
@@ -22,7 +23,7 @@ enum { X = 900, V = 17, DER_V = 3, FORCE = 42, SAMPLED = 43, K = 5, C = 6, ENERG
 
 typedef struct {
   fmi2CallbackFunctions callbacks;
-  int mode, tells;
+  int mode, tells, evaluations;
   double x, v, force, sampled, k, c;
 } oscillator;
 
@@ -39,7 +40,7 @@ static fmi2Status refuse(oscillator *m, const char *what) {
 fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, fmi2String resources,
                               const fmi2CallbackFunctions *callbacks, fmi2Boolean visible, fmi2Boolean logging) {
   oscillator *m = callbacks->allocateMemory(1, sizeof *m);
-  *m = (oscillator){*callbacks, MADE, logging, 1.0, 0.0, 0.0, 0.0, 2.0, 0.3};
+  *m = (oscillator){*callbacks, MADE, logging, 0, 1.0, 0.0, 0.0, 0.0, 2.0, 0.3};
 #ifdef NO_RESOURCE
   refuse(m, "a table that is not there");
   callbacks->freeMemory(m);
@@ -152,6 +153,9 @@ static double acceleration(const oscillator *m) { return -m->k * m->x - m->c * m
 
 fmi2Status fmi2GetDerivatives(fmi2Component c, double dx[], size_t n) {
   ONLY(INITIALIZING | EVENT | CONTINUOUS, "fmi2GetDerivatives");
+#ifdef TIRES
+  if (((oscillator *)c)->evaluations++ >= 40) return fmi2Discard;
+#endif
   dx[0] = ((oscillator *)c)->v, dx[1] = acceleration(c);
   return fmi2OK;
 }

@@ -11,8 +11,8 @@ import pytest
 pytest.importorskip("fmpy")
 
 from ctmhe import MHE, RK4, DiscountedCost, FmuModel, FmuPlant, Input, Measurement
-from ctmhe.errors import FmuBinaryError, FmuError
-from ctmhe.simulation.fmu.check import PARAMETERS, check_fmu
+from ctmhe.errors import FmuBinaryError, FmuDerivativeError, FmuError
+from ctmhe.simulation.fmu.check import PARAMETERS, PLANT, UNUSABLE, check_fmu
 from tests.models.stranger import PORTABLE, stranger
 
 pytestmark = pytest.mark.skipif(not PORTABLE, reason="needs Linux and a C compiler")
@@ -112,3 +112,11 @@ def test_what_an_fmu_does_to_the_process_is_undone(tmp_path, macro, kind):
     path = stranger(tmp_path, macro)
     ended = subprocess.run([sys.executable, "-W", "ignore", "-c", program, path], cwd=os.getcwd(), check=False)
     assert ended.returncode == 0
+
+
+def test_an_fmu_that_fails_where_it_did_not_is_no_model(tmp_path):
+    """Whatever the check that it fails in, the error is one of FMUs."""
+    path = stranger(tmp_path, "TIRES")
+    with pytest.raises(FmuDerivativeError, match="discard"):
+        FmuModel(path)
+    assert check_fmu(path).verdict in {PLANT, UNUSABLE}
