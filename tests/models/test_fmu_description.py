@@ -197,7 +197,12 @@ def test_arrays_that_matter_are_listed_as_unsupported(tmp_path, role):
         (FMI3, 'Alias name="T"', 'Alias name="k"', "'k'"),
         (FMI3, '<EventIndicator valueReference="3"', '<EventIndicator valueReference="33"', "EventIndicator.*'33'"),
         (FMI3, 'fixedInternalStepSize="0.01"', 'fixedInternalStepSize="0"', "'fixedInternalStepSize'"),
-        (FMI3, '"1" declaredType="T"', '"1" declaredType="T" variability="discrete"', "'v'.*'x' is discrete"),
+        (
+            FMI3.replace("CoSimulation", "ModelExchange"),
+            '"1" declaredType="T"',
+            '"1" declaredType="T" variability="discrete"',
+            "'v'.*'x' is discrete",
+        ),
     ],
 )
 def test_what_is_inconsistent_is_named(tmp_path, text, old, new, told):
@@ -205,6 +210,21 @@ def test_what_is_inconsistent_is_named(tmp_path, text, old, new, told):
     assert old in text
     with pytest.raises(FmuArchiveError, match=told):
         read(tmp_path, text.replace(old, new))
+
+
+def test_a_co_simulation_does_without_derivatives_that_are_wrong(tmp_path):
+    """They matter to model exchange only; PythonFMU lists derivatives of inputs."""
+    text = FMI3.replace('"1" declaredType="T"', '"1" declaredType="T" causality="input"')
+    about = read(tmp_path, text)
+    assert about.states == about.derivatives == ()
+    assert names(about.inputs) == ("x",)
+    assert any("'v'" in remark and "no states" in remark for remark in about.remarks)
+
+
+def test_a_unit_without_a_name_is_left_out(tmp_path):
+    """PythonFMU defines one for variables that have no unit."""
+    units = '<Unit name=""><BaseUnit/></Unit><Unit name="degC">'
+    assert set(read(tmp_path, FMI2.replace('<Unit name="degC">', units)).units) == {"degC"}
 
 
 @pytest.mark.parametrize("version", ["1.0", "2.1", "2.0.1", "3", "3.0-beta.1", "4.0", "", "3.0.0.0", "3.٣"])

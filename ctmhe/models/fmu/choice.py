@@ -112,6 +112,8 @@ class Choice:
             "library": str(binary(about, folder, self.kind)),
             "name": about.name or "fmu",
             "token": about.token,
+            "complaints": list(about.complaints),
+            "complaint_count": len(about.complaints),
             "resources": resources.as_uri() if about.major == 2 else f"{resources}/",
             "version": about.major,
             "co_simulation": int(not self.exchange),
@@ -141,10 +143,13 @@ class Choice:
             "start_time": about.start_time or 0.0,
             "step": self.step or 0.0,
             "p_in_event_mode": 0,
+            # the standards let discrete inputs change there only
+            "inputs_in_event_mode": int(self.exchange and any(v.variability == "discrete" for v in driven)),
             "directional": int(self.exchange and interface.directional_derivatives),
             "reach": REACH,
-            "differenced": [0] * (nx + len(driven) + len(self.parameters)),
-            # only of outputs and derivatives may directional derivatives be asked
+            # only by states and continuous inputs may directional derivatives be asked, parameters are tried,
+            "differenced": [0] * nx + [int(v.variability == "discrete") for v in driven] + [0] * len(self.parameters),
+            # and only of outputs and derivatives may directional derivatives be asked
             "rows_differenced": [0] * nx + [int(not k) for k in known],
         }
 

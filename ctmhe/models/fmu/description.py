@@ -110,6 +110,8 @@ class Description:
     sources : mapping kind -> tuple of Sources
         Empty for an FMU without C files.
     description : str
+    complaints : tuple of str
+        Those of its log categories that the standard keeps for warnings and errors.
     remarks : tuple of str
         What in it is of no use, and what is taken instead.
     """
@@ -136,6 +138,7 @@ class Description:
     platforms: tuple[str, ...] = ()
     sources: Mapping[str, tuple[Sources, ...]] = field(default_factory=dict)
     description: str = ""
+    complaints: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
 
     @property

@@ -8,13 +8,14 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import weakref
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from select import select
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -27,6 +28,7 @@ log = logging.getLogger(__name__)
 
 SOURCES = Path(__file__).parent / "evaluator"
 LOADING = 60.0  # seconds that an FMU may take to load and initialize in a worker
+LAST_WORDS, TAIL = 3, 2000  # lines and bytes of what an FMU printed before it failed that a message shows
 _renew_type = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.POINTER(ctypes.c_int), ctypes.POINTER(ctypes.c_int))
 
 
@@ -75,30 +77,37 @@ class Worker:
     def __init__(self, configuration: dict[str, Any], references: list[int]):
         self.name = configuration["name"]
         command = [sys.executable, "-I", "-S", worker.__file__]
-        pipe, silent = subprocess.PIPE, subprocess.DEVNULL
-        self.process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=silent, bufsize=0)
-        assert self.process.stdin and self.process.stdout
-        self.to, self.back = self.process.stdin.fileno(), self.process.stdout.fileno()
-        self._end = weakref.finalize(self, _end, self.process)
+        pipe = subprocess.PIPE
+        with tempfile.TemporaryFile() as printed:  # what it prints while it opens
+            self.process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=printed, bufsize=0)
+            assert self.process.stdin and self.process.stdout
+            self.to, self.back = self.process.stdin.fileno(), self.process.stdout.fileno()
+            self._end = weakref.finalize(self, _end, self.process)
+            answer = self._opened(configuration, references, printed)
+        self.values, self.next_event = answer["values"], answer["next_event"]
+
+    def _opened(self, configuration: dict[str, Any], references: list[int], printed: BinaryIO) -> dict[str, Any]:
+        """Have the FMU opened and return the answer."""
         try:
             with suppress(BrokenPipeError):
                 request = {"evaluator": library().path, "configuration": configuration, "references": references}  # pyright: ignore
-                worker.send(self.to, request)
+                worker.send(self.to, request | {"path": [path for path in sys.path if path]})
             if not select([self.back], [], [], LOADING)[0]:
                 raise FmuBinaryError(f"the binary of {self.name} does not finish loading: no answer in {LOADING:g} s")
             answer = worker.receive(self.back)
         except EOFError:
+            fate = self.fate()
             raise FmuBinaryError(
-                f"the binary of {self.name} crashes when it is loaded ({self.fate()}): it is damaged, or was made for "
-                "another system; export the FMU again"
+                f"the binary of {self.name} crashes when it is loaded ({fate}{_last_words(printed)}): it is damaged, "
+                "or was made for another system; export the FMU again"
             ) from None
         except BaseException:
             self.close()
             raise
         if "failed" in answer:
             self.close()
-            raise unusable(self.name, answer["failed"])
-        self.values, self.next_event = answer["values"], answer["next_event"]
+            raise unusable(self.name, answer["failed"] + _last_words(printed))
+        return answer
 
     def fate(self) -> str:
         """Return how the process ended."""
@@ -111,6 +120,13 @@ class Worker:
     def close(self) -> None:
         """End the process."""
         self._end()
+
+
+def _last_words(printed: BinaryIO) -> str:
+    """Return the end of what an FMU printed, to follow a reason."""
+    printed.seek(max(0, printed.seek(0, os.SEEK_END) - TAIL))
+    lines = [line.strip() for line in printed.read().decode("utf-8", "replace").splitlines() if line.strip()]
+    return f"; it printed: {' / '.join(lines[-LAST_WORDS:])}" if lines else ""
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import logging
-import os
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -26,6 +25,7 @@ from ctmhe.errors import (
 )
 from ctmhe.models.fmu.description import CO_SIMULATION, MODEL_EXCHANGE, Description, Variable
 from ctmhe.models.fmu.messages import callbacks2, listener3
+from ctmhe.models.fmu.surroundings import kept
 from ctmhe.types import Array
 
 log = logging.getLogger(__name__)
@@ -115,7 +115,16 @@ class Instance:
         module = fmpy.fmi2 if self._version == 2 else fmpy.fmi3
         suffix = "Model" if kind == MODEL_EXCHANGE else "Slave"
         factory = getattr(module, f"FMU{self._version}{suffix}")
-        here = os.getcwd()
+        with kept():  # fmpy, too, steps into the FMU's folder and stays there when loading fails
+            self._load(fmpy, factory, folder)
+            self._instantiate(fmpy)
+        self._life = _Life(self._fmu)
+        self._free = weakref.finalize(self, _release, self._life)
+        self._nx, self._nz = len(description.states), description.event_indicators
+        self._derivatives, self._indicators = (ctypes.c_double * self._nx)(), (ctypes.c_double * self._nz)()
+
+    def _load(self, fmpy: Any, factory: Any, folder: Path) -> None:
+        description = self.description
         try:
             self._fmu = factory(
                 guid=description.token,
@@ -128,13 +137,6 @@ class Instance:
                 f"the binary of {description.name} ({self.interface.identifier}) cannot be loaded: {error}. "
                 f"The FMU needs a binary for this platform ({fmpy.platform_tuple})"
             ) from error
-        finally:
-            os.chdir(here)  # fmpy steps into the FMU's folder and stays there when loading fails
-        self._instantiate(fmpy)
-        self._life = _Life(self._fmu)
-        self._free = weakref.finalize(self, _release, self._life)
-        self._nx, self._nz = len(description.states), description.event_indicators
-        self._derivatives, self._indicators = (ctypes.c_double * self._nx)(), (ctypes.c_double * self._nz)()
 
     @property
     def event_mode(self) -> bool:
@@ -156,7 +158,14 @@ class Instance:
             if self.kind == CO_SIMULATION:
                 options |= {"eventModeUsed": self.event_mode, "earlyReturnAllowed": True}
         try:
-            self._fmu.instantiate(**options)
+            try:
+                self._fmu.instantiate(**options)
+            except Exception:
+                if self.messages:
+                    raise
+                self._fmu.instantiate(**options, loggingOn=True)  # to hear why
+            if self.description.complaints:
+                self._ask_for_complaints(options)
         except Exception as error:
             self._fmu.freeLibrary()
             advice = (
@@ -167,6 +176,16 @@ class Instance:
             raise FmuBinaryError(
                 f"{self.description.name} cannot be instantiated for {self.kind}{self._told()}. {advice}"
             ) from error
+
+    def _ask_for_complaints(self, options: Mapping[str, Any]) -> None:
+        """Have the FMU tell what is wrong, and nothing else: all that it could tell takes long."""
+        try:
+            self._fmu.setDebugLogging(True, list(self.description.complaints))
+        except Exception as error:  # after which an instance is of no use
+            log.info("%s does not take wishes about its log: %s", self.description.name, error)
+            release = self._fmu.fmi2FreeInstance if self._version == 2 else self._fmu.fmi3FreeInstance
+            release(self._fmu.component)
+            self._fmu.instantiate(**options)
 
     def _told(self) -> str:
         return f"; it says: {' / '.join(self.messages)}" if self.messages else ""

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ctmhe.errors import FmuError, FmuEventError, FmuWarning, InputError
+from ctmhe.errors import FmuDerivativeError, FmuError, FmuEventError, FmuWarning, InputError
 from ctmhe.models.fmu.archive import Unpacked
 from ctmhe.models.fmu.choice import Choice, Names, choose
 from ctmhe.models.fmu.evaluators import Evaluator, Evaluators, Worker
@@ -159,21 +159,29 @@ class FmuModel:
                 seconds=seconds,
                 thorough=check == "full",
             )
-            findings = examination.run()
+            try:
+                findings = examination.run()
+            except FloatingPointError as error:
+                raise _unsteady(about.name, str(error)) from error
             configuration, found, points = findings.configuration, found + findings.warnings, findings.usable
         self.warnings = found
-        differenced = configuration["differenced"], configuration["rows_differenced"]
-        self.exact_derivatives = bool(configuration["directional"]) and not any(map(any, differenced))
+        asked = [True] * nx + [v in choice.disturbed for v in choice.driven] + [True] * len(choice.parameters)
+        differenced = [d and a for d, a in zip(configuration["differenced"], asked, strict=True)]
+        differenced += configuration["rows_differenced"]
+        self.exact_derivatives = bool(configuration["directional"]) and not any(differenced)
         self._evaluators = Evaluators(configuration, references, alone=self.single_instance, seconds=seconds)
         sizes = tuple(configuration[key] for key in ("nx", "nu", "nw", "np", "ny"))
         functions = FmuFunctions(self._evaluators, sizes, self.u.nominal)
         self._functions, self.dynamics, self.output = functions, functions.dynamics, functions.output
         if check == "full":
-            same_when_mapped(self.name, self.dynamics, points, self.x.names, len(self.w))
+            try:
+                same_when_mapped(self.name, self.dynamics, points, self.x.names, len(self.w))
+            except RuntimeError as error:  # CasADi's, which has no cause
+                raise _unsteady(about.name, self._evaluators.mine().message()) from error
         if self.single_instance:
             self._evaluators.release()
         for text in found:
-            warnings.warn(text, FmuWarning, stacklevel=4)
+            warnings.warn(text, FmuWarning, stacklevel=3)
 
     def evaluator(self) -> Evaluator:
         """Return this thread's evaluator, which solvers call without CasADi."""
@@ -214,6 +222,13 @@ class FmuModel:
             self._evaluators.close()
             self._evaluators = None
         self._archive.close()
+
+
+def _unsteady(name: str, reason: str) -> FmuDerivativeError:
+    return FmuDerivativeError(
+        f"{name} fails where it could be evaluated before: {reason}. What it says must not depend on the calls made "
+        "before: export it with another tool, or use it as the plant (FmuPlant)"
+    )
 
 
 def _reopen(path: str, digest: str, arguments: dict[str, Any]) -> FmuModel:

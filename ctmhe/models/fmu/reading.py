@@ -24,6 +24,7 @@ from ctmhe.models.fmu.structure import (
 )
 from ctmhe.models.fmu.units import BASE, Unit
 
+COMPLAINTS = {f"logStatus{status}" for status in ("Warning", "Discard", "Error", "Fatal")}
 INITIALS = {"exact", "approx", "calculated"}
 MAX_INDICATORS = 1_000_000  # FMI 2 states a number that nothing else in the file confirms
 
@@ -52,7 +53,14 @@ def read_description(folder: Path) -> Description:
     structure = read_structure(root, major, raws)
     remarks: list[str] = []
     variables, own = _reals(root, major, raws, remarks)
-    states, derivatives, unsupported = dynamics(structure["derivatives"], major, raws)
+    try:
+        states, derivatives, unsupported = dynamics(structure["derivatives"], major, raws)
+    except FmuArchiveError as error:
+        if MODEL_EXCHANGE in kinds:
+            raise
+        # a co-simulation integrates itself, and does without them
+        remarks.append(f"what it says of its derivatives is of no use ({error}), so it has no states")
+        states, derivatives, unsupported = [], [], {}
     unsupported = unsupported_variables(raws, structure) | unsupported
     inputs = [raw for raw in own if raw.causality == "input"]
     if major == 2:
@@ -87,6 +95,11 @@ def read_description(folder: Path) -> Description:
         platforms=_platforms(folder),
         sources=read_sources(root, folder, major, kinds),
         description=top.text("description"),
+        complaints=tuple(
+            element.get("name", "")
+            for element in root.findall("LogCategories/Category")
+            if element.get("name") in COMPLAINTS
+        ),
         remarks=tuple(remarks),
         **experiment,
     )
@@ -237,7 +250,9 @@ def _units(root: Element) -> dict[str, Unit]:
     units: dict[str, Unit] = {}
     names: set[str] = set()
     for element in root.findall("UnitDefinitions/Unit"):
-        name = Reader(element, "a unit").required("name")
+        name = element.get("name")
+        if not name:  # some tools define one for variables without a unit
+            continue
         if name in names:
             raise FmuArchiveError(f"modelDescription.xml: two units are named {name[:100]!r}; export the FMU again")
         names.add(name)

@@ -34,7 +34,11 @@ class Reference:
                 instance.initialize(about.start_time or 0.0, self._settable(given))
                 instance.set_time(t)
                 instance.set_states(x)
-                instance.set(choice.inputs, u)
+                if any(v.variability == "discrete" for v in choice.inputs):
+                    instance.event(t, choice.inputs, u)
+                    instance.set_states(x)  # which an event may change
+                else:
+                    instance.set(choice.inputs, u)
                 return instance.derivatives(), instance.get(choice.outputs)
             states = dict(zip([v.name for v in choice.states], x, strict=True))
             instance.initialize(t, self._settable(given | states | inputs))

@@ -231,12 +231,7 @@ class Examination:
             try:
                 wrong = self._wrong(points, slopes)
             except FloatingPointError as error:
-                self.warnings.append(
-                    f"{self.name}: its directional derivatives fail ({error}); derivatives are finite differences"
-                )
-                self.configuration["directional"] = 0
-                self._choose_reach(slopes)
-                wrong = self._wrong(points, slopes)
+                wrong = self._with_fewer(points, slopes, str(error))
         if wrong and self.configuration["directional"]:
             said = "; ".join(
                 f"d {row} / d {column} is {has:.6g} and not {should:.6g}" for row, column, _, has, should in wrong[:3]
@@ -258,6 +253,34 @@ class Examination:
                 f"jump in {column!r}: export the FMU with directional derivatives, or with tighter "
                 "tolerances of its own solvers"
             )
+
+    def _with_fewer(self, points: Sequence[Point], slopes: Sequence[Any], reason: str) -> list[Any]:
+        """Take differences where the FMU refuses directional derivatives; return what is wrong then.
+
+        FMI 2 grants them by states and continuous inputs only, so that parameters are the first to be left out.
+        """
+        self._choose_reach(slopes)
+        taken: list[str] = []
+        for key, group in {"p": "parameters", "v": "inputs"}.items():
+            part = self.parts[key]
+            if part.start == part.stop:
+                continue
+            self.configuration["differenced"][part] = [1] * (part.stop - part.start)
+            taken.append(group)
+            try:
+                wrong = self._wrong(points, slopes)
+            except FloatingPointError:
+                continue
+            self.warnings.append(
+                f"{self.name}: its directional derivatives by {' and '.join(taken)} fail ({reason}); these are finite "
+                "differences"
+            )
+            return wrong
+        self.warnings.append(
+            f"{self.name}: its directional derivatives fail ({reason}); derivatives are finite differences"
+        )
+        self.configuration["directional"] = 0
+        return self._wrong(points, slopes)
 
     def _slopes(self, point: Point) -> dict[float, tuple[dict[str, Array], dict[str, Array]]]:
         """Return, for each reach, the one-sided slopes (backward, forward) (rows, n) by x, driven inputs and p."""
@@ -360,11 +383,15 @@ class Examination:
                 if name in declared:
                     silent.append(name)
                 continue
+            about = self.choice.about.variables
+            same = {about[n].reference for n in known if n in about}  # whichever of its names is listed
             for key, part in self.parts.items():
                 if key == "p" and self.choice.about.major == 2:  # which counts them during initialization only
                     continue
                 for n, j in zip(self.columns[key], range(part.start, part.stop), strict=True):
-                    if n not in known and any(abs(J[i, j]) > ROUND_OFF * np.abs(J[i]).max() for J in Js):
+                    if about[n].reference not in same and any(
+                        abs(J[i, j]) > ROUND_OFF * np.abs(J[i]).max() for J in Js
+                    ):
                         missing.append(f"{name} on {n}")
         if missing:
             self.warnings.append(

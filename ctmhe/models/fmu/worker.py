@@ -15,7 +15,7 @@ import sys
 from contextlib import suppress
 from typing import Any
 
-VERSION = 1  # of fmu.h
+VERSION = 2  # of fmu.h
 CALLS = ("set time", "set states", "set values", "get derivatives", "get values", "directional", "step", "other")
 
 _text, _int, _double, _pointer = ctypes.c_char_p, ctypes.c_int, ctypes.c_double, ctypes.c_void_p
@@ -29,13 +29,15 @@ class Configuration(ctypes.Structure):
 
     _fields_ = [
         *((name, _text) for name in ("library", "name", "token", "resources")),
+        ("complaints", ctypes.POINTER(_text)),
+        ("complaint_count", _int),
         *((name, _int) for name in ("version", "co_simulation", "nx", "nu", "nw", "np", "ny", "inputs", "starts")),
         *((name, _references) for name in ("x", "dx", "input", "p", "y", "start")),
         *((name, _doubles) for name in ("start_value", "input_base")),
         *((name, _ints) for name in ("input_u", "input_w", "w_state", "w_output", "y_state")),
         *((name, _doubles) for name in ("x_size", "input_size", "p_size")),
         *((name, _double) for name in ("start_time", "step")),
-        *((name, _int) for name in ("p_in_event_mode", "directional")),
+        *((name, _int) for name in ("p_in_event_mode", "inputs_in_event_mode", "directional")),
         ("reach", _double),
         *((name, _flags) for name in ("differenced", "rows_differenced")),
     ]  # fmt: skip
@@ -50,6 +52,10 @@ def configuration(values: dict[str, Any]) -> Configuration:
         value = values[name]
         if kind is _text:
             value = os.fsencode(value)
+        elif kind is ctypes.POINTER(_text):
+            value = (_text * max(len(value), 1))(*map(os.fsencode, value))
+            kept.append(value)
+            value = ctypes.cast(value, kind)
         elif kind not in (_int, _double):
             value = (kind._type_ * max(len(value), 1))(*value)
             kept.append(value)
@@ -133,6 +139,7 @@ def main() -> None:
     with suppress(OSError, AttributeError):  # Linux: no process is left when its parent dies
         ctypes.CDLL(None).prctl(1, signal.SIGKILL)
     request = receive(0)
+    sys.path[:] = request["path"]  # FMUs written in Python import what the session that asks could
     try:
         library = load(request["evaluator"])
         made = configuration(request["configuration"])  # which the evaluator points to
@@ -141,6 +148,10 @@ def main() -> None:
     except OSError as error:
         send(out, {"failed": str(error)})
         return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):  # whoever reads them stops here
+        os.dup2(nowhere, stream)
+    os.close(nowhere)
     send(out, {"values": values, "next_event": event})
     library.ctmhe_fmu_serve(model, 0, out)
     library.ctmhe_fmu_close(model)

@@ -45,6 +45,8 @@ typedef struct {
   instance (*instantiate_simulation3)(const char *, const char *, const char *, bool, bool, bool, bool,
                                       const uint32_t *, size_t, void *, log3, void *);
   void (*release)(instance);
+  int (*debug2)(instance, int, size_t, const char *const *);
+  int (*debug3)(instance, bool, size_t, const char *const *);
   int (*setup2)(instance, int, double, double, int, double);
   int (*enter_initialization2)(instance);
   int (*enter_initialization3)(instance, bool, double, double, bool, double);
@@ -107,6 +109,7 @@ static const char *find_functions(library_handle handle, int version, int co_sim
   if (version == 2) {
     NEED(instantiate2, "fmi2Instantiate");
     NEED(release, "fmi2FreeInstance");
+    FIND(debug2, "fmi2SetDebugLogging");
     NEED(setup2, "fmi2SetupExperiment");
     NEED(enter_initialization2, "fmi2EnterInitializationMode");
     NEED(exit_initialization, "fmi2ExitInitializationMode");
@@ -128,6 +131,7 @@ static const char *find_functions(library_handle handle, int version, int co_sim
     }
   } else {
     NEED(release, "fmi3FreeInstance");
+    FIND(debug3, "fmi3SetDebugLogging");
     NEED(enter_initialization3, "fmi3EnterInitializationMode");
     NEED(exit_initialization, "fmi3ExitInitializationMode");
     NEED(set3, "fmi3SetFloat64");

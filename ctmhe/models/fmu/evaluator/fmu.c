@@ -3,11 +3,14 @@
 #include "calls.h"
 #include "messages.h"
 
+#include <fenv.h>
 #include <math.h>
 
 #ifdef _WIN32
 #define API __declspec(dllexport)
 #else
+#include <fcntl.h>
+#include <unistd.h>
 #define API __attribute__((visibility("default")))
 #endif
 
@@ -26,6 +29,7 @@ typedef struct {
   saved_state origin;             /* of a co-simulation: where every step starts */
   double next_event;
   int broken;                     /* the instance has to be made anew */
+  int silent;                     /* it does not take wishes about its log */
   int outputs;                    /* y that are no states */
   uint32_t *unknown;              /* dx, then those outputs */
   int *row;                       /* of the outputs: index of y */
@@ -130,19 +134,37 @@ static void discard_instance(fmu *m) {
   m->fmu = NULL, m->origin = NULL;
 }
 
-/* Make the instance, or make it anew. */
-static int instantiate(fmu *m) {
+static instance made(fmu *m, int logging) {
   const ctmhe_fmu_configuration *c = m->c;
+  if (c->version == 2)
+    return m->f.instantiate2(c->name, c->co_simulation, c->token, c->resources, &m->callbacks, 0, logging);
+  if (c->co_simulation)
+    return m->f.instantiate_simulation3(c->name, c->token, c->resources, false, logging, false, false, NULL, 0, m,
+                                        listen3, NULL);
+  return m->f.instantiate_exchange3(c->name, c->token, c->resources, false, logging, m, listen3);
+}
+
+/* Have the FMU tell what is wrong, and nothing else: all that it could tell takes long. Returns whether it failed. */
+static int ask_for_complaints(fmu *m) {
+  const ctmhe_fmu_configuration *c = m->c;
+  const size_t n = (size_t)c->complaint_count;
+  if (n == 0) return 0;
+  if (m->f.debug2) return m->f.debug2(m->fmu, 1, n, c->complaints) > FMI_WARNING;
+  return m->f.debug3 && m->f.debug3(m->fmu, true, n, c->complaints) > FMI_WARNING;
+}
+
+/* Make the instance, or make it anew; use `instantiate`. */
+static int instantiate_anyhow(fmu *m) {
   discard_instance(m);
   m->broken = m->known_t = m->known_v = m->known_p = m->placed = 0;
   m->instances++;
-  if (c->version == 2)
-    m->fmu = m->f.instantiate2(c->name, c->co_simulation, c->token, c->resources, &m->callbacks, 0, 0);
-  else if (c->co_simulation)
-    m->fmu = m->f.instantiate_simulation3(c->name, c->token, c->resources, false, false, false, false, NULL, 0, m,
-                                          listen3, NULL);
-  else
-    m->fmu = m->f.instantiate_exchange3(c->name, c->token, c->resources, false, false, m, listen3);
+  m->fmu = made(m, 0);
+  if (!m->fmu && !m->told[0]) m->fmu = made(m, 1); /* to hear why */
+  if (m->fmu && !m->silent && ask_for_complaints(m)) { /* after an error an instance is of no use */
+    m->silent = 1;
+    m->f.release(m->fmu);
+    m->fmu = made(m, 0);
+  }
   if (!m->fmu) {
     m->failed = "the instantiation", m->failed_status = FMI_ERROR;
     m->broken = FMI_ERROR;
@@ -151,6 +173,24 @@ static int instantiate(fmu *m) {
   if (!initialize(m)) return 0;
   if (!m->broken) m->broken = FMI_ERROR; /* discarded: no better for it */
   return 1;
+}
+
+/* Some FMUs leave another rounding mode, or traps, or go to another folder, which our host must not notice. */
+static int instantiate(fmu *m) {
+  fenv_t ours;
+  fegetenv(&ours);
+#ifndef _WIN32
+  const int here = open(".", O_RDONLY | O_CLOEXEC);
+#endif
+  const int failed = instantiate_anyhow(m);
+#ifndef _WIN32
+  if (here >= 0) {
+    (void)!fchdir(here);
+    close(here);
+  }
+#endif
+  fesetenv(&ours);
+  return failed;
 }
 
 /* ---- values ----------------------------------------------------------------------------------------------------- */
@@ -179,7 +219,9 @@ static int settle(fmu *m, double t, const double *x, const double *v, const doub
   }
   if (nv && !(m->known_v && memcmp(m->set_v, v, nv * sizeof *v) == 0)) {
     m->known_v = 0;
+    if (c->inputs_in_event_mode && CALL(OTHER, "fmiXEnterEventMode", enter_events(m->fmu))) return 1;
     if (set(m, c->input, nv, v)) return 1;
+    if (c->inputs_in_event_mode && iterate_events(m)) return 1;
     memcpy(m->set_v, v, nv * sizeof *v);
     m->known_v = 1;
   }
@@ -377,11 +419,11 @@ static int failed(fmu *m) {
   } while (0)
   SAY(" at t = %.8g", m->t);
   for (int k = 0; k < 3; k++) {
-    for (int i = 0; i < parts[k].n && used < 700; i++) {
+    for (int i = 0; parts[k].values && i < parts[k].n && used < 700; i++) {
       if (i == 0) SAY(", %s = [", parts[k].name);
       SAY(i ? ", %.8g" : "%.8g", parts[k].values[i]);
     }
-    if (parts[k].n) SAY("]");
+    if (parts[k].values && parts[k].n) SAY("]");
   }
   if (m->told[0]) SAY("; it says: %s", m->told);
 #undef SAY
@@ -443,7 +485,10 @@ API void *ctmhe_fmu_open(const ctmhe_fmu_configuration *c, char *message, size_t
   m->straight = c->directional && !m->dx_differenced && !m->y_differenced;
   for (int i = 0; i < c->nx + c->inputs + c->np; i++) m->straight &= !c->differenced[i];
   m->next_event = HUGE_VAL;
+  fenv_t ours;
+  fegetenv(&ours); /* libraries made with -ffast-math make small numbers zero in the whole thread */
   m->library = open_library(c->library, message, size);
+  fesetenv(&ours);
   if (!m->library) return give_up(m, message, size);
   const char *missing = find_functions(m->library, c->version, c->co_simulation, &m->f);
   if (!missing && c->directional && !(c->version == 2 ? m->f.directional2 != NULL : m->f.directional3 != NULL))

@@ -7,13 +7,15 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#define CTMHE_FMU_VERSION 1
+#define CTMHE_FMU_VERSION 2
 
 /* How the FMU's variables make up the model. All arrays belong to the caller and outlive the evaluator.
  *
  * The FMU's inputs that are set are u, inputs that are disturbed, or both: value = base + u + w. */
 typedef struct {
   const char *library, *name, *token, *resources; /* path of the binary, instance name, GUID, URI (FMI 2) or path */
+  const char *const *complaints;       /* categories of its log that tell what is wrong; their number */
+  int complaint_count;
   int version, co_simulation;          /* 2 or 3; 0: model exchange */
   int nx, nu, nw, np, ny, inputs, starts;
   const uint32_t *x, *dx, *input, *p, *y, *start; /* value references; y only where y_state is -1 */
@@ -23,7 +25,7 @@ typedef struct {
   const int *y_state;                  /* (ny): the state that y is, or -1 */
   const double *x_size, *input_size, *p_size; /* typical magnitudes: steps of differences */
   double start_time, step;             /* seconds; step: of co-simulation */
-  int p_in_event_mode;                 /* parameters are set in event mode instead of as they come */
+  int p_in_event_mode, inputs_in_event_mode; /* parameters, inputs are set in event mode instead of as they come */
   int directional;                     /* ask the FMU for directional derivatives */
   double reach;                        /* relative step of central differences */
   const uint8_t *differenced;          /* (nx + inputs + np): columns taken by differences all the same */

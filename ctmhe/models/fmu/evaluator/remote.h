@@ -2,8 +2,6 @@
 #ifndef CTMHE_REMOTE_H
 #define CTMHE_REMOTE_H
 
-enum { LIVES = 10 }; /* workers that may be lost until ctmhe_fmu_begin: a new one takes a while, and a solve may try often */
-
 /* A question is its kind, then t, x, u, w, p; the answer a status, then dx, y, J, or the length of a message, then
  * that. Numbers are doubles: both ends are this machine. */
 enum { ASK_DX = 1, ASK_Y = 2, ASK_J = 4 };
@@ -31,6 +29,8 @@ API void *ctmhe_fmu_remote(int nx, int nu, int nw, int np, int ny, int in, int o
 }
 
 #else
+
+enum { LIVES = 10 }; /* workers that may be lost until ctmhe_fmu_begin: a new one takes a while, and a solve may try often */
 
 #include <errno.h>
 #include <poll.h>
