@@ -214,6 +214,26 @@ def test_threads_have_evaluators_of_their_own_where_the_fmu_allows():
     gc.collect()
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_forked_child_has_a_worker_of_its_own():
+    """Parent and child ask at the same time and get their own answers; the parent's worker outlives the child."""
+    model = pendulum(isolated=True)
+    evaluate, worker = model.evaluator().evaluate, model.evaluator()._worker
+    expected = evaluate(*POINT)[0]
+    child = os.fork()
+    if child == 0:
+        right = all(np.array_equal(evaluate(*POINT)[0], expected) for _ in range(200))
+        os._exit(0 if right else 1)
+    other = (POINT[0], 2 * POINT[1], *POINT[2:])
+    mine = [evaluate(*other)[0] for _ in range(200)]
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    np.testing.assert_array_equal(mine, np.tile(pendulum().evaluator().evaluate(*other)[0], (200, 1)))
+    assert model.evaluator()._worker is worker
+    assert worker.process.poll() is None
+    model.close()
+
+
 def test_after_close_a_model_says_so():
     """Its evaluator is gone, and so is the folder."""
     model = pendulum()

@@ -75,14 +75,14 @@ class Worker:
     """
 
     def __init__(self, configuration: dict[str, Any], references: list[int]):
-        self.name = configuration["name"]
+        self.name, self.owner = configuration["name"], os.getpid()
         command = [sys.executable, "-I", "-S", worker.__file__]
         pipe = subprocess.PIPE
         with tempfile.TemporaryFile() as printed:  # what it prints while it opens
             self.process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=printed, bufsize=0)
             assert self.process.stdin and self.process.stdout
             self.to, self.back = self.process.stdin.fileno(), self.process.stdout.fileno()
-            self._end = weakref.finalize(self, _end, self.process)
+            self._end = weakref.finalize(self, _end, self.process, self.owner)
             answer = self._opened(configuration, references, printed)
         self.values, self.next_event = answer["values"], answer["next_event"]
 
@@ -129,10 +129,12 @@ def _last_words(printed: BinaryIO) -> str:
     return f"; it printed: {' / '.join(lines[-LAST_WORDS:])}" if lines else ""
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
+def _end(process: subprocess.Popen[bytes], owner: int) -> None:
     for stream in (process.stdin, process.stdout):
         if stream:
             stream.close()
+    if owner != os.getpid():
+        return
     try:
         process.wait(timeout=1.0)
     except subprocess.TimeoutExpired:
@@ -249,8 +251,10 @@ class Evaluator:
     def new_worker(self) -> Worker:
         """Replace the worker process."""
         assert self._worker is not None
-        self._worker.process.kill()
-        log.warning("the worker process of %s ended (%s); a new one is started", self._worker.name, self._worker.fate())
+        if self._worker.owner == os.getpid():  # else this is a forked child, and the worker its parent's
+            self._worker.process.kill()
+            fate = self._worker.fate()
+            log.warning("the worker process of %s ended (%s); a new one is started", self._worker.name, fate)
         self._worker = Worker(*self._arguments)
         return self._worker
 
@@ -291,7 +295,7 @@ class Evaluators:
         self._local = threading.local()
         self._lock = threading.Lock()
         self._all: weakref.WeakSet[Evaluator] = weakref.WeakSet()
-        self._closed, self._process = False, os.getpid()
+        self._closed = False
 
     def mine(self) -> Evaluator:
         """Return this thread's evaluator.

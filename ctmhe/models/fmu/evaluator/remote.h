@@ -38,6 +38,7 @@ enum { LIVES = 10 }; /* workers that may be lost until ctmhe_fmu_begin: a new on
 
 struct remote {
   int nx, nu, nw, np, ny, in, out, dead, lives;
+  pid_t owner;                    /* a forked child needs a worker of its own */
   double seconds;
   ctmhe_fmu_renew renew;
   double buffer[];
@@ -88,6 +89,7 @@ static int ask(fmu *m, double t, const double *x, const double *u, const double 
     int n;
   } parts[] = {{x, r->nx}, {u, r->nu}, {w, r->nw}, {p, r->np}};
   double *at = r->buffer, status;
+  if (r->owner != getpid()) r->owner = getpid(), r->dead = 1;
   if (r->dead && (r->lives <= 0 || (r->dead = r->renew(&r->in, &r->out)))) {
     m->failures++;
     return 1;
@@ -114,7 +116,7 @@ static int ask(fmu *m, double t, const double *x, const double *u, const double 
 }
 
 static remote *new_remote(int nx, int nu, int nw, int np, int ny) {
-  const remote sizes = {nx, nu, nw, np, ny, -1, -1, 0, LIVES, 0.0, NULL};
+  const remote sizes = {nx, nu, nw, np, ny, -1, -1, 0, LIVES, getpid(), 0.0, NULL};
   const size_t given = question_size(&sizes), taken = answer_size(&sizes, ASK_DX | ASK_Y | ASK_J);
   remote *r = malloc(sizeof *r + (given > taken ? given : taken) * sizeof(double));
   if (r) *r = sizes;
