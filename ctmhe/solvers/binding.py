@@ -16,7 +16,7 @@ from ctmhe.errors import SolverError
 from ctmhe.solvers.tape import BATCH, tape_of
 from ctmhe.transcription.stage import StageFunction
 
-VERSION = 7
+VERSION = 8
 MAX_ARGUMENTS = 64
 CONVERGED, ITERATION_LIMIT, NOT_FINITE, NO_DECREASE, SINGULAR, DEADLINE = range(6)
 METHODS = {"step map": 0, "RK4": 1}

@@ -17,6 +17,9 @@ SANITIZE = "-O0 -g -fsanitize=address,undefined -fno-sanitize-recover=all -fno-o
 TESTS = (
     "test_core.py", "test_covariance.py", "test_updates.py", "test_wide.py", "test_degenerate.py", "test_slots.py",
     "../estimators/test_real_time.py::test_a_prepared_quadrotor_is_the_quadrotor",
+    "../models/test_fmu_evaluators.py::test_the_core_integrates_an_fmu_as_casadi_does",
+    "../models/test_fmu_evaluators.py::test_an_isolated_fmu_gives_the_same_numbers",
+    "../models/test_fmu_evaluators.py::test_co_simulation_is_a_step_map",
 )  # fmt: skip
 # without the core, or with more builds of it
 LEFT_OUT = "numpy or compiled or library_for_one_model or every_size_gives or any_window or CVODES or correlated"

@@ -37,7 +37,7 @@ TWO = {
 
 class _Call(ctypes.Structure):
     _fields_ = [("arg", ctypes.c_void_p * 9), ("res", ctypes.c_void_p * 3), ("t", ctypes.c_double),
-                ("h", ctypes.c_double)]  # fmt: skip
+                ("h", ctypes.c_double), ("inner", ctypes.c_int)]  # fmt: skip
 
 
 @pytest.fixture(scope="module", params=["any", "baseline", "compiled"])

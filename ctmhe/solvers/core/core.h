@@ -17,7 +17,7 @@
 extern "C" {
 #endif
 
-#define CTMHE_CORE_VERSION 7
+#define CTMHE_CORE_VERSION 8
 #define CTMHE_BATCH 8          /* slots that a tape is run for at once */
 #define CTMHE_MAX_ARGUMENTS 64 /* pointers a compiled stage function may use (CasADi's sz_arg, sz_res) */
 
