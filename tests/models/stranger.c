@@ -8,6 +8,7 @@
  *   PYTHON             it needs a module that the session can import
  *   ROUNDS_UP          it leaves another rounding mode, and traps on
  *   TIRES              it discards every evaluation after the first 40 of an instance
+ *   ENDLESS            it cannot be ended, and tells when it is freed
  *   GOES_AWAY          it leaves another working directory */
 #define _GNU_SOURCE
 #include <fenv.h>
@@ -66,7 +67,13 @@ fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, f
   return m;
 }
 
-void fmi2FreeInstance(fmi2Component c) { ((oscillator *)c)->callbacks.freeMemory(c); }
+void fmi2FreeInstance(fmi2Component c) {
+  oscillator *m = c;
+#ifdef ENDLESS
+  m->callbacks.logger(m->callbacks.componentEnvironment, "stranger", fmi2OK, "logEvents", "freed");
+#endif
+  m->callbacks.freeMemory(c);
+}
 
 fmi2Status fmi2SetDebugLogging(fmi2Component c, fmi2Boolean on, size_t n, const fmi2String categories[]) {
   for (size_t i = 0; i < n; i++)
@@ -98,6 +105,9 @@ fmi2Status fmi2ExitInitializationMode(fmi2Component c) {
 
 fmi2Status fmi2Terminate(fmi2Component c) {
   ONLY(EVENT | CONTINUOUS, "fmi2Terminate");
+#ifdef ENDLESS
+  return refuse(c, "the end");
+#endif
   return fmi2OK;
 }
 

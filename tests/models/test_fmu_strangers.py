@@ -120,3 +120,10 @@ def test_an_fmu_that_fails_where_it_did_not_is_no_model(tmp_path):
     with pytest.raises(FmuDerivativeError, match="discard"):
         FmuModel(path)
     assert check_fmu(path).verdict in {PLANT, UNUSABLE}
+
+
+def test_an_fmu_that_cannot_be_ended_is_freed(tmp_path, caplog):
+    """fmi2Terminate fails; the instance goes all the same."""
+    caplog.set_level("DEBUG", "ctmhe.models.fmu")
+    FmuPlant(stranger(tmp_path, "ENDLESS")).close()
+    assert "freed" in caplog.text

@@ -8,6 +8,7 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -135,7 +136,7 @@ class Instance:
         except Exception as error:
             raise FmuBinaryError(
                 f"the binary of {description.name} ({self.interface.identifier}) cannot be loaded: {error}. "
-                f"The FMU needs a binary for this platform ({fmpy.platform_tuple})"
+                f"The FMU needs a binary for this platform ({fmpy.platform_tuple}) that has every function of FMI"
             ) from error
 
     @property
@@ -461,12 +462,13 @@ def _forget(owner: Callable[[], Instance | None], pointer: Any) -> None:
 def _release(life: _Life) -> None:
     if life.fatal:
         return  # the standard forbids any further call
-    try:
-        if life.running:
-            life.fmu.terminate()
-        for pointer in life.saved.values():
-            life.fmu.freeFMUState(pointer)
-        life.saved.clear()
-        life.fmu.freeInstance()
-    except Exception:
-        log.debug("freeing an FMU failed", exc_info=True)
+    calls = [life.fmu.terminate] if life.running else []
+    calls += [partial(life.fmu.freeFMUState, pointer) for pointer in life.saved.values()]
+    life.saved.clear()
+    for call in (*calls, life.fmu.freeInstance):  # an FMU that cannot even be ended is freed all the same
+        try:
+            call()
+        except Exception as error:
+            log.debug("freeing an FMU failed", exc_info=True)
+            if getattr(error, "status", OK) == FATAL:
+                return
