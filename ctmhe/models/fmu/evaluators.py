@@ -28,6 +28,7 @@ log = logging.getLogger(__name__)
 
 SOURCES = Path(__file__).parent / "evaluator"
 LOADING = 60.0  # seconds that an FMU may take to load and initialize in a worker
+LONGEST = 1e6  # seconds of patience that can be counted
 LAST_WORDS, TAIL = 3, 2000  # lines and bytes of what an FMU printed before it failed that a message shows
 _renew_type = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.POINTER(ctypes.c_int), ctypes.POINTER(ctypes.c_int))
 
@@ -182,7 +183,7 @@ class Evaluator:
             self.values, self.next_event = self._worker.values, self._worker.next_event
             itself = weakref.ref(self)  # which the callback would keep alive
             self._renew = _renew_type(lambda to, back: _renew(itself, to, back))
-            away = (self._worker.back, self._worker.to, seconds, self._renew)
+            away = (self._worker.back, self._worker.to, min(seconds, LONGEST), self._renew)
             self.pointer = self._library.ctmhe_fmu_remote(*self._sizes, *away)
             self._end = weakref.finalize(self, self._library.ctmhe_fmu_close, self.pointer)
         self.point = tuple(np.zeros(size) for size in self._sizes[:4])

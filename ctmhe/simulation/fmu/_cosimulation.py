@@ -16,6 +16,9 @@ from ctmhe.types import Array
 SHORTEST = 2.0**-10  # of a communication step, when the FMU discards longer ones
 
 
+EXPERIMENT = 500  # steps that the default experiment takes when it does not say
+
+
 class CoSimulation:
     """An FMU that integrates itself.
 
@@ -33,7 +36,13 @@ class CoSimulation:
         self._step = step or ((self._interface.fixed_step or description.step) if self._fixed else None)
         if self._fixed and self._step is None:
             raise FmuError(f"{description.name} needs communication steps of one length; give it with step=")
-        length = f"steps of {self._step} s" if self._step else "steps as they come"
+        # FMUs that integrate with one step each communication step (explicit Euler in some tools) need short ones
+        span = (description.stop_time or 0.0) - (description.start_time or 0.0)
+        self._longest = description.step or (span / EXPERIMENT if span > 0 else np.inf)
+        if self._step:
+            length = f"steps of {self._step} s"
+        else:
+            length = f"steps of at most {self._longest:g} s" if self._longest < np.inf else "steps as they come"
         self.method = f"the FMU itself (co-simulation, {length})"
         self.t, self._held = 0.0, np.zeros(len(self._inputs))
         events = description.major > 2 and self._interface.event_mode  # then discrete inputs change in event mode only
@@ -105,9 +114,9 @@ class CoSimulation:
     def _count(self, span: float, *, varying: bool) -> int:
         step = self._step
         if step is None:
-            if not varying or self._interface.input_derivatives:
-                return 1
-            step = min(span / 10, self._about.step or np.inf)
+            step = self._longest
+            if varying and not self._interface.input_derivatives:
+                step = min(step, span / 10)
         count = max(1, int(np.ceil(span / step - 1e-6)))
         if self._fixed and abs(span - count * step) > 1e-6 * step:
             raise FmuError(

@@ -49,8 +49,8 @@ class FmuPlant:
     parameters : mapping name -> value, optional
         Values set at initialization; the names become `p`.
     step : float, optional
-        Largest communication step in seconds (co-simulation). When left out, a constant input makes one step of
-        every `advance`, a varying one at least ten.
+        Largest communication step in seconds (co-simulation). When left out, that of the FMU's default experiment, or
+        a 500th of its duration; a varying input makes at least ten steps of every `advance`.
     rtol, atol : float
         Tolerances of the integration (model exchange); `atol` is multiplied by the states' nominals.
     isolated : bool
