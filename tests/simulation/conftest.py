@@ -17,6 +17,16 @@ settings.register_profile("no deadline", deadline=None)  # a busy machine is not
 settings.load_profile("no deadline")
 
 
+@pytest.fixture(params=["scikits.odes", "scipy"])
+def integrator(request, monkeypatch) -> str:
+    """What integrates FMU plants: each in turn."""
+    if request.param == "scipy":
+        monkeypatch.setattr("ctmhe.simulation.fmu._integrators.cvode_installed", lambda: False)
+    else:
+        pytest.importorskip("scikits_odes_sundials")
+    return request.param
+
+
 @pytest.fixture
 def on_paper(monkeypatch, tmp_path) -> Callable[..., tuple[Path, SimpleNamespace]]:
     """Return a function that makes a model an FMU: (its path, a journal of what happens to its instances)."""

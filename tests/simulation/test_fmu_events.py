@@ -8,21 +8,11 @@ import pytest
 pytest.importorskip("fmpy")
 
 from ctmhe.errors import FmuError, FmuEventError
-from ctmhe.simulation.fmu import _integrators as _fmu_integrators
 from ctmhe.simulation.fmu.plant import FmuPlant
 from fmus.build import build
 from tests.simulation.paper import Paper
 
 G, E = 9.81, 0.7
-
-
-@pytest.fixture(params=["scikits.odes", "scipy"])
-def integrator(request, monkeypatch):
-    if request.param == "scipy":
-        monkeypatch.setattr(_fmu_integrators, "cvode_installed", lambda: False)
-    else:
-        pytest.importorskip("scikits_odes_sundials")
-    return request.param
 
 
 @pytest.fixture(params=[2, 3], ids=["FMI2", "FMI3"])

@@ -6,21 +6,11 @@ import pytest
 pytest.importorskip("fmpy")
 
 from ctmhe.errors import FmuBinaryError, FmuError, FmuKindError, FmuParameterError, FmuUnsupportedError
-from ctmhe.simulation.fmu import _integrators as _fmu_integrators
 from ctmhe.simulation.fmu.plant import FmuPlant
 from fmus.build import build
 from tests.simulation.paper import DISCARD, ERROR, FATAL, Paper, Refusal
 
 SAVES = {"canGetAndSetFMUstate": "true", "canGetAndSetFMUState": "true"}
-
-
-@pytest.fixture(params=["scikits.odes", "scipy"])
-def integrator(request, monkeypatch):
-    if request.param == "scipy":
-        monkeypatch.setattr(_fmu_integrators, "cvode_installed", lambda: False)
-    else:
-        pytest.importorskip("scikits_odes_sundials")
-    return request.param
 
 
 def go(plant, *times):

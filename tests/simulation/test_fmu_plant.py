@@ -14,7 +14,6 @@ from scipy.integrate import solve_ivp
 pytest.importorskip("fmpy")
 
 from ctmhe.errors import FmuError, InputError
-from ctmhe.simulation.fmu import _integrators as _fmu_integrators
 from ctmhe.simulation.fmu.plant import FmuPlant
 from fmus.build import build
 
@@ -24,15 +23,6 @@ K1, K2 = 0.2, 0.0064
 @pytest.fixture(scope="module", params=[2, 3], ids=["FMI2", "FMI3"])
 def path(request):
     return build("batch_reactor", fmi=request.param)
-
-
-@pytest.fixture(params=["scikits.odes", "scipy"])
-def integrator(request, monkeypatch):
-    if request.param == "scipy":
-        monkeypatch.setattr(_fmu_integrators, "cvode_installed", lambda: False)
-    else:
-        pytest.importorskip("scikits_odes_sundials")
-    return request.param
 
 
 def truth(x, start, end, d_pA=lambda t: 0.0, d_pB=lambda t: 0.0):
