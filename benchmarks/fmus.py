@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import gc
-import json
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -27,7 +26,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.limits import Row, apart, line, resident, row
+from benchmarks.limits import Row, apart, collected, resident, row
 from ctmhe import CVODES, MHE, RK4, ContinuousModel, DiscountedCost, FmuModel, Input, Measurement
 from ctmhe.models.library import batch_reactor, hover_speed, quadrotor, van_der_pol
 from ctmhe.types import Array, Estimate
@@ -298,15 +297,7 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
         "load": lambda: load(options.problems),
         "cycles": lambda: cycles(options.cycles),
     }
-    rows: list[Row] = []
-    for part in options.parts or parts:
-        print(f"\n{part}", flush=True)
-        for result in run[part]():
-            rows.append(result)
-            print(line(result), flush=True)
-            if options.json:
-                options.json.write_text("[\n" + ",\n".join(json.dumps(each) for each in rows) + "\n]\n")
-    return rows
+    return collected({part: run[part] for part in options.parts or parts}, options.json)
 
 
 if __name__ == "__main__":

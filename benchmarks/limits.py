@@ -265,6 +265,19 @@ def line(result: Row) -> str:
     return f"{result['problem']:<10}{result['what']:<44}{value:>14.6g} {result['unit']:<16}{judged}".rstrip()
 
 
+def collected(parts: dict[str, Callable[[], Iterator[Row]]], path: Path | None) -> list[Row]:
+    """Run parts of a benchmark, print each row when it is there and rewrite the file with those so far."""
+    rows: list[Row] = []
+    for title, run in parts.items():
+        print(f"\n{title}", flush=True)
+        for result in run():
+            rows.append(result)
+            print(line(result), flush=True)
+            if path:
+                path.write_text("[\n" + ",\n".join(json.dumps(each) for each in rows) + "\n]\n")
+    return rows
+
+
 def main(arguments: Sequence[str] | None = None) -> list[Row]:
     """Run the benchmark from the command line and return its rows."""
     parser = argparse.ArgumentParser(
@@ -287,15 +300,7 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
         "endurance": lambda: endurance(options.updates, options.compile),
         "memory": lambda: memory(options.problems),
     }
-    rows: list[Row] = []
-    for part in options.parts or parts:
-        print(f"\n{part}", flush=True)
-        for result in run[part]():
-            rows.append(result)
-            print(line(result), flush=True)
-            if options.json:
-                options.json.write_text("[\n" + ",\n".join(json.dumps(each) for each in rows) + "\n]\n")
-    return rows
+    return collected({part: run[part] for part in options.parts or parts}, options.json)
 
 
 if __name__ == "__main__":
