@@ -254,10 +254,7 @@ def model_kind(about: Description, kind: str | None, step: float | None) -> str:
     """Return the kind an estimator uses, or raise `FmuKindError`."""
     if kind is None:
         kind = MODEL_EXCHANGE if MODEL_EXCHANGE in about.kinds and step is None else CO_SIMULATION
-    if kind not in (MODEL_EXCHANGE, CO_SIMULATION):
-        raise InputError(f"kind must be {MODEL_EXCHANGE!r} or {CO_SIMULATION!r}, got {kind!r}")
-    if kind not in about.kinds:
-        raise FmuKindError(f"{about.name} does not offer {kind}; it offers {', '.join(about.kinds) or 'neither kind'}")
+    check_kind(about, kind)
     if kind == MODEL_EXCHANGE:
         if step is not None:
             raise InputError("step= is for co-simulation; the integrator of model exchange is the estimator's")
@@ -282,6 +279,14 @@ def model_kind(about: Description, kind: str | None, step: float | None) -> str:
     return kind
 
 
+def check_kind(about: Description, kind: str, whose: str = "") -> None:
+    """Raise `InputError` for what is no kind, `FmuKindError` for one that the FMU does not offer."""
+    if kind not in (MODEL_EXCHANGE, CO_SIMULATION):
+        raise InputError(f"{whose}kind must be {MODEL_EXCHANGE!r} or {CO_SIMULATION!r}, got {kind!r}")
+    if kind not in about.kinds:
+        raise FmuKindError(f"{about.name} does not offer {kind}; it offers {', '.join(about.kinds) or 'neither kind'}")
+
+
 def check_supported(about: Description) -> None:
     """Raise `FmuUnsupportedError` for arrays and structural parameters."""
     for name, what in about.unsupported.items():
@@ -293,9 +298,17 @@ def check_supported(about: Description) -> None:
 def start_values(about: Description, start: Mapping[str, float], states: Sequence[Variable]) -> dict[str, float]:
     """Return checked start values by name."""
     known = tuple(v for v in about.variables.values() if v.settable or v in states)
-    values = {}
-    for name, value in start.items():
-        if not np.isfinite(value):
-            raise InputError(f"start: {name!r} is {value}, not finite")
-        values |= {variable.name: float(value) for variable in about.select("start value", [name], known)}
-    return values
+    return finite_values(about, start, known, role="start value", label="start:")
+
+
+def finite_values(
+    about: Description, values: Mapping[str, float], known: Sequence[Variable], *, role: str, label: str
+) -> dict[str, float]:
+    """Return values of `known` variables by name; the keys may be patterns, and each value has to be finite."""
+    found: dict[str, float] = {}
+    for key, value in values.items():
+        for variable in about.select(role, key, known):
+            if not np.isfinite(value):
+                raise InputError(f"{label} {variable.name!r} is {value}, not finite")
+            found[variable.name] = float(value)
+    return found

@@ -59,7 +59,7 @@ class FmuModel:
         How thoroughly values and derivatives are compared with the FMU's own: at three points, at the start, not.
     isolated : bool or float
         Run the FMU in a process of its own, so that its crash or hang (longer than so many seconds, 10 for True) is a
-        failed evaluation. Some 10 microseconds more per evaluation.
+        failed evaluation. A round trip more per evaluation.
 
     Attributes
     ----------

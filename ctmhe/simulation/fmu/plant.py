@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ctmhe.errors import FmuError, FmuKindError, FmuUnsupportedError, InputError
+from ctmhe.errors import FmuError, FmuUnsupportedError, InputError
 from ctmhe.models.fmu.archive import Unpacked
-from ctmhe.models.fmu.choice import probe
+from ctmhe.models.fmu.choice import check_kind, finite_values, probe
 from ctmhe.models.fmu.description import CO_SIMULATION, MODEL_EXCHANGE, Description, Variable, signals_of
 from ctmhe.models.fmu.reading import read_description
 from ctmhe.models.signals import Signals
@@ -319,10 +319,7 @@ def chosen_kind(about: Description, kind: str | None) -> str:
     """Return the kind to use, or raise `FmuKindError` when the FMU does not offer it."""
     if kind is None:
         kind = MODEL_EXCHANGE if MODEL_EXCHANGE in about.kinds else CO_SIMULATION
-    if kind not in {MODEL_EXCHANGE, CO_SIMULATION}:
-        raise InputError(f"FmuPlant: kind must be {MODEL_EXCHANGE!r} or {CO_SIMULATION!r}, got {kind!r}")
-    if kind not in about.kinds:
-        raise FmuKindError(f"{about.name} does not offer {kind}; it offers {', '.join(about.kinds) or 'neither kind'}")
+    check_kind(about, kind, "FmuPlant: ")
     return kind
 
 
@@ -350,12 +347,4 @@ def rebuilt(path: Path, digest: str, arguments: Mapping[str, Any]) -> FmuPlant:
 def plant_parameters(about: Description, values: Mapping[str, float]) -> dict[str, float]:
     """Return checked values, by name, of variables that may be set at initialization."""
     known: tuple[Variable, ...] = tuple(v for v in about.variables.values() if v.settable and v.causality != "input")
-    numbers = {
-        variable.name: float(value)
-        for name, value in values.items()
-        for variable in about.select("parameter", name, known)
-    }
-    for name, value in numbers.items():
-        if not np.isfinite(value):
-            raise InputError(f"FmuPlant: parameter {name!r} is {value}, not finite")
-    return numbers
+    return finite_values(about, values, known, role="parameter", label="FmuPlant: parameter")
