@@ -159,7 +159,7 @@ odes_failed() {
 
 case "$purpose" in
   demo) extras=fmu,plot ;;
-  test) extras=fmu,plot,notebook,dev ;;
+  test) extras=fmu,plot,study,cluster,tune,notebook,dev ;;
   *) fail "usage: tools/setup.sh demo|test" ;;
 esac
 

@@ -16,6 +16,7 @@ from ctmhe.data.log import Log
 from ctmhe.data.window import held_inputs
 from ctmhe.errors import InputError, NotEstimated, TooLate
 from ctmhe.estimators.guesses import open_loop, resting_guess, starting_points
+from ctmhe.estimators.outlook import carried_covariance, prior_covariance
 from ctmhe.estimators.priors import empty_path, filtering_prior, path_rows, trajectory_at
 from ctmhe.estimators.state import State, load_state, save_state
 from ctmhe.models.continuous import Model
@@ -572,6 +573,34 @@ class MHE:
         except FloatingPointError:
             logger.warning("the prediction from t = %g s to %g s holds the state: the model fails", t0, t1)
         return x
+
+    def prior_covariance(self, t: float = 0.0) -> Array:
+        """Return the covariance (n, n) of (x, estimated p) that the prior's weight P stands for at `t`: its inverse."""
+        return frozen(prior_covariance(self.assembly, t))
+
+    def propagate_covariance(self, state: State, t0: float, t1: float, x: Array, p: Array, covariance: Array) -> Array:
+        """Return the covariance (n, n) of (x, estimated p) at `t1` along the open loop from `x`, `p` at `t0`.
+
+        What `Estimate.covariance` would be at `t1` if nothing were measured from `t0` on: disturbances of weight Q
+        spread it, the discount widens it. Infinite variances stay infinite in all signals that they reach.
+
+        Parameters
+        ----------
+        state : State
+            Whose inputs are known; the last one is held.
+        t0, t1 : float
+            Seconds; multiples of the step for a `DiscreteModel`.
+        x : array (nx,)
+        p : array (np,)
+        covariance : array (n, n)
+            At `t0`, with n = nx, or nx + np where the parameters are estimated.
+        """
+        if t1 <= t0:
+            return covariance
+        records = Records(np.empty(0), np.empty((0, len(self.model.y))), *self._known_inputs(state, t0, t1))
+        mesh = self._prediction_mesh(t0, t1, records)
+        drive = self._inputs_on(mesh, records)
+        return frozen(carried_covariance(self.stage, self.assembly, mesh, *drive, x, p, covariance))
 
     def _prediction_mesh(self, t0: float, t1: float, records: Records) -> Mesh:
         return self.assembly.mesh(t0, t1, records, growing=False)

@@ -53,6 +53,41 @@ class Progress:
     short_gaps: int = 0
 
 
+class Forecast:
+    """What is expected from the last estimate on; computed when asked, kept for the last time asked for."""
+
+    def __init__(self, mhe: MHE, now: Progress):
+        self.mhe, self.estimator, self.base, self.estimate = mhe, now.state, now.base, now.estimate
+        self.known: dict[str, tuple[float, Array]] = {}
+
+    def state(self, t: float) -> Array:
+        """Return the predicted state at `t`."""
+
+        def compute() -> Array:
+            t0, x0, p = self.base
+            return x0 if t <= t0 else self.mhe.propagate(self.estimator, t0, t, x0, p)
+
+        return self._kept("state", t, compute)
+
+    def output(self, t: float) -> Array:
+        """Return the predicted output at `t`."""
+        return self._kept("output", t, lambda: self.mhe.output(self.estimator, t, self.state(t), self.base[2]))
+
+    def covariance(self, t: float) -> Array:
+        """Return the predicted covariance at `t`."""
+        return self._kept("covariance", t, lambda: self._covariance(t))
+
+    def _covariance(self, t: float) -> Array:
+        state = self.estimator
+        known = self.mhe.prior_covariance(state.t) if self.estimate is None else self.estimate.covariance
+        return self.mhe.propagate_covariance(state, state.t, t, state.x, state.p, known)
+
+    def _kept(self, name: str, t: float, compute: Callable[[], Array]) -> Array:
+        if name not in self.known or self.known[name][0] != t:
+            self.known[name] = (t, frozen(compute()))
+        return self.known[name][1]
+
+
 @dataclass(frozen=True, eq=False)
 class Segment:
     """A stretch of time on which the input is linear and w constant."""
@@ -103,6 +138,7 @@ class Loop:
         self.disturbance, self.inputs = disturbance, inputs
         self.times, self.monitor, self.seed = times, monitor, seed
         self.locate = locate and self.watch.has_guard
+        self.parameters = self.model.p.names if mhe.assembly.p_estimated else ()
         self.recorder = Recorder(self)
 
     def run(self, *, truth: Any, p_true: Any, guess: Any, p: Any, progress: bool) -> Run:
@@ -216,22 +252,12 @@ class Loop:
             elapsed=t - now.last_event,
             samples=now.samples,
             outputs=self.model.y.names,
+            states=self.model.x.names,
+            parameters=self.parameters,
             estimate=now.estimate,
-            forecast=self._forecast(t),
+            forecast=Forecast(self.mhe, now),
+            seed=self.seed,
         )
-
-    def _forecast(self, t: float) -> Callable[[], tuple[Array, Array]]:
-        """Return a function that predicts state and output for `t` from the last estimate, once."""
-        mhe, state, (t0, x0, p) = self.mhe, self.now.state, self.now.base
-        known: list[tuple[Array, Array]] = []
-
-        def forecast() -> tuple[Array, Array]:
-            if not known:
-                x = frozen(x0 if t <= t0 else mhe.propagate(state, t0, t, x0, p))
-                known.append((x, frozen(mhe.output(state, t, x, p))))
-            return known[0]
-
-        return forecast
 
     def _level_in(self, segment: Segment, t: float) -> float:
         """Return the level at `t` with the plant there, as seen from inside the segment: the left limit at its end."""

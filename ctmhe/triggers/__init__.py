@@ -1,6 +1,6 @@
 """When to sample: policies, how to write one, and how to join them."""
 
-from ctmhe.triggers.base import Predicate, Trigger, TriggerContext, trigger
+from ctmhe.triggers.base import Outlook, Predicate, Trigger, TriggerContext, trigger
 from ctmhe.triggers.compose import And, MaxInterval, MinInterval, Or
 from ctmhe.triggers.innovation import Innovation
 from ctmhe.triggers.loading import build_trigger, load_trigger
@@ -14,6 +14,7 @@ __all__ = [
     "MaxInterval",
     "MinInterval",
     "Or",
+    "Outlook",
     "Periodic",
     "Predicate",
     "Scheduled",

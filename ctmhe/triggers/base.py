@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -12,6 +12,28 @@ from ctmhe.errors import InputError, TriggerError
 from ctmhe.types import Array, Estimate
 
 QUESTIONS = ("fires", "guard", "next_time")
+
+
+class Outlook(Protocol):
+    """What is expected from the last estimate on: without disturbance, the last known input held.
+
+    All times are absolute, in seconds, and not before the time of the context.
+    """
+
+    def state(self, t: float) -> Array:
+        """Return the state predicted for `t`, (nx,)."""
+        ...
+
+    def output(self, t: float) -> Array:
+        """Return the output predicted for `t`, (ny,): h at the predicted state, without noise."""
+        ...
+
+    def covariance(self, t: float) -> Array:
+        """Return the covariance predicted for `t` of (x, estimated p), (n, n); infinite where nothing is known.
+
+        It is what `Estimate.covariance` would be at `t` if nothing were measured until then.
+        """
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +54,19 @@ class TriggerContext:
         Samples sent so far.
     outputs : tuple of str
         Names of the entries of `y`.
+    states : tuple of str
+        Names of the entries of `prediction`.
+    parameters : tuple of str
+        Names of the estimated parameters, which follow the states in covariances.
     estimate : Estimate or None
-        The last estimate, None before the first.
+        The last estimate, None before the first. Where the channel loses, delays or alters what is sent, it is that of
+        a copy of the estimator at the sensor, which knows what was sent.
     state : Any
         The policy's own memory, see `Trigger.init_state`.
-    forecast : callable or None
-        Returns `(prediction, y_hat)`; the simulation hands in a function that computes them once, when asked.
+    forecast : Outlook or None
+        State, output and covariance predicted for `t` and later times; computed when asked.
+    seed : int
+        The seed of the run: policies that draw lots derive theirs from it, see `lots`.
     """
 
     t: float
@@ -46,19 +75,22 @@ class TriggerContext:
     elapsed: float = 0.0
     samples: int = 0
     outputs: tuple[str, ...] = ()
+    states: tuple[str, ...] = ()
+    parameters: tuple[str, ...] = ()
     estimate: Estimate | None = None
     state: Any = None
-    forecast: Callable[[], tuple[Array, Array]] | None = None
+    forecast: Outlook | None = None
+    seed: int = 0
 
     @property
     def prediction(self) -> Array:
         """State predicted for `t`, (nx,): open loop from the last estimate with w = 0 and the last input held."""
-        return self._forecast()[0]
+        return self._outlook().state(self.t)
 
     @property
     def y_hat(self) -> Array:
         """Output predicted for `t`, (ny,): h at the prediction, without noise."""
-        return self._forecast()[1]
+        return self._outlook().output(self.t)
 
     @property
     def covariance(self) -> Array:
@@ -69,6 +101,15 @@ class TriggerContext:
             )
         return self.estimate.covariance
 
+    @property
+    def predicted_covariance(self) -> Array:
+        """Covariance of (x, estimated p) predicted for `t`, (n, n), that of the prior before the first sample."""
+        return self._outlook().covariance(self.t)
+
+    def lots(self, *key: int) -> np.random.Generator:
+        """Return a generator that depends on the run's seed and `key` (integers >= 0) only, so that runs repeat."""
+        return np.random.default_rng([self.seed, *key])
+
     def output_index(self, name: str) -> int:
         """Return the position of output `name` in `y`."""
         try:
@@ -76,10 +117,10 @@ class TriggerContext:
         except ValueError:
             raise InputError(f"unknown output {name!r}. Known: {', '.join(self.outputs) or 'none'}") from None
 
-    def _forecast(self) -> tuple[Array, Array]:
+    def _outlook(self) -> Outlook:
         if self.forecast is None:
             raise InputError("TriggerContext: this context carries no prediction")
-        return self.forecast()
+        return self.forecast
 
 
 class Trigger:

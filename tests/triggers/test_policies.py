@@ -1,6 +1,7 @@
 """Elementary policies: what they answer, and what happens when they answer nonsense."""
 
 import pickle
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -25,9 +26,25 @@ from ctmhe.triggers import (
 from ctmhe.types import frozen
 
 
+@dataclass(frozen=True, eq=False)
+class Foreseen:
+    """An outlook that stays as it is."""
+
+    y: np.ndarray
+
+    def state(self, t):
+        return frozen([0.0])
+
+    def output(self, t):
+        return self.y
+
+    def covariance(self, t):
+        return frozen([[1.0]])
+
+
 def context(t=1.0, y=(0.0,), y_last=(0.0,), samples=1, y_hat=None, **more):
     """Build a context with outputs a, b, ... and prediction `y_hat`."""
-    prediction = None if y_hat is None else (lambda: (frozen([0.0]), frozen(y_hat)))
+    prediction = None if y_hat is None else Foreseen(frozen(y_hat))
     names = tuple("abcdef"[: len(y)])
     return TriggerContext(t, frozen(y), frozen(y_last), samples=samples, outputs=names, forecast=prediction, **more)
 
