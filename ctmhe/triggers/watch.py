@@ -143,7 +143,9 @@ def _leaves(policy: Trigger) -> Iterator[Trigger]:
 def _level(leaf: Trigger, kind: str, row: Standing, ctx: TriggerContext, t: float) -> float:
     """Return one elementary policy's level at `ctx`, with named times judged at `t`."""
     if kind == "guard":
-        return -np.inf if row.silent else ask_level(leaf, replace(ctx, state=row.memory))
+        if row.silent:
+            return -np.inf
+        return ask_level(leaf, ctx if row.memory is None else replace(ctx, state=row.memory))
     agrees = row.yes if kind == "fires" else t >= row.due - tolerance(t)
     return np.inf if agrees else -np.inf
 
