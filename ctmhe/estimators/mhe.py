@@ -582,7 +582,8 @@ class MHE:
         """Return the covariance (n, n) of (x, estimated p) at `t1` along the open loop from `x`, `p` at `t0`.
 
         What `Estimate.covariance` would be at `t1` if nothing were measured from `t0` on: disturbances of weight Q
-        spread it, the discount widens it. Infinite variances stay infinite in all signals that they reach.
+        spread it, the discount widens it. Infinite variances stay infinite in all signals that they reach. Where the
+        model cannot be evaluated, all variances are infinite.
 
         Parameters
         ----------
@@ -598,7 +599,11 @@ class MHE:
         if t1 <= t0:
             return covariance
         drive = self._open_loop(state, t0, t1)
-        return frozen(carried_covariance(self.stage, self.assembly, *drive, x, p, covariance))
+        try:
+            return frozen(carried_covariance(self.stage, self.assembly, *drive, x, p, covariance))
+        except FloatingPointError:
+            logger.warning("the covariance from t = %g s to %g s is infinite: the model fails", t0, t1)
+            return frozen(np.diag(np.full(len(covariance), np.inf)))
 
     def _open_loop(self, state: State, t0: float, t1: float) -> tuple[Mesh, Array, Array]:
         """Return the mesh of a prediction and the inputs at both ends of its slots."""
