@@ -20,9 +20,9 @@ class TokenBucket(Trigger):
     """At most burst + rate s samples in any s seconds: `policy & TokenBucket(5, 3)`.
 
     Every sample takes a token. Tokens grow at `rate` up to `burst`, the bucket is full at the start, and the level is
-    tokens(t) - 1. A sample held back for want of a token is taken at the very moment when the token is there. Samples of policies joined by `|` take
-    tokens as well, even into debt. Turner, New directions in communications (or which way to the information age?),
-    IEEE Communications Magazine 24 (1986), no. 10, 8-15.
+    tokens(t) - 1. A sample held back for want of a token is taken at the very moment when the token is there. Samples
+    of policies joined by `|` take tokens as well, even into debt. Turner, New directions in communications (or which
+    way to the information age?), IEEE Communications Magazine 24 (1986), no. 10, 8-15.
 
     Parameters
     ----------

@@ -23,9 +23,9 @@ class InnovationEnergy(Trigger):
         E(t) = integral over (t_i, t] of eta^(t - s) |y(s) - y_hat(s)|^2_R ds  >=  alpha J_i + floor
 
     E is what the open loop adds to the output part of the cost (3.13): as long as it is small against J_i, another
-    solve has little to win. It is counted by the trapezoidal rule on monitoring times and the moment asked about. The first
-    sample is taken at once. Outputs without a value (NaN) are passed over. Where the last solve gave no finite cost,
-    only `floor` counts.
+    solve has little to win. It is counted by the trapezoidal rule on monitoring times and the moment asked about. The
+    first sample is taken at once. Outputs without a value (NaN) are passed over. Where the last solve gave no finite
+    cost, only `floor` counts.
 
     The continuous-time form, which is ours, of the rule of Krauss, Schiller, Lopez, Mueller, Event-triggered moving
     horizon estimation for nonlinear systems, arXiv 2408.06208 (2024). `WholeSignal` is the channel that fits.

@@ -119,8 +119,9 @@ def _describes(value: Any) -> bool:
 
 
 def _phase(part: Any) -> Any:
-    pair = isinstance(part, (list, tuple)) and len(part) == 2
-    return (part[0], build_trigger(part[1])) if pair else build_trigger(part)
+    if isinstance(part, (list, tuple)):
+        return part if len(part) != 2 else (part[0], build_trigger(part[1]))
+    return build_trigger(part)
 
 
 def _named(name: str) -> Any:
