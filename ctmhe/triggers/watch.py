@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ctmhe.triggers.base import Trigger, TriggerContext, ask_level, ask_time, ask_yes, initial_memory, kind_of, remember
+from ctmhe.triggers.answers import ask_level, ask_time, ask_yes, initial_memory, kind_of, remember, settle
+from ctmhe.triggers.base import Trigger, TriggerContext
 from ctmhe.triggers.compose import And, Combined
 from ctmhe.triggers.timing import tolerance
 
@@ -97,7 +98,15 @@ class Watch:
         `before` is the context at the sample, `after` the one that knows of it and of the new estimate.
         """
         state = self._remember(state, before, fired=True)
-        spent = WatchState(tuple(replace(row, yes=False) for row in state.standings))
+        rows = zip(self.leaves, state.standings, strict=True)
+        spent = WatchState(
+            tuple(
+                replace(row, yes=False)
+                if type(leaf).after_sample is Trigger.after_sample
+                else replace(row, yes=False, memory=settle(leaf, after, row.memory))
+                for leaf, row in rows
+            )
+        )
         state = self._plan(spent, after, earliest=after.t + 2 * tolerance(after.t))
         if self.level(state, after) < 0:
             return state
