@@ -22,6 +22,7 @@ from ctmhe.simulation import (
     replay,
     simulate,
 )
+from ctmhe.studies import Study, StudyResult, explore, find_threshold, latin_hypercube, pareto_front, sobol
 from ctmhe.transcription import CVODES, RK4
 from ctmhe.triggers import (
     Budget,
@@ -115,6 +116,8 @@ __all__ = [
     "State",
     "Status",
     "Stochastic",
+    "Study",
+    "StudyResult",
     "TokenBucket",
     "TooLate",
     "Trajectory",
@@ -124,7 +127,12 @@ __all__ = [
     "Uniform",
     "WholeSignal",
     "check_fmu",
+    "explore",
+    "find_threshold",
+    "latin_hypercube",
+    "pareto_front",
     "replay",
     "simulate",
+    "sobol",
     "trigger",
 ]
