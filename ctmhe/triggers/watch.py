@@ -118,6 +118,11 @@ class Watch:
             )
         )
 
+    def silenced(self, state: WatchState) -> WatchState:
+        """Return the state in which no guard speaks until policies are asked again, at the next monitoring time."""
+        rows = zip(self.kinds, state.standings, strict=True)
+        return WatchState(tuple(replace(row, silent=True) if kind == "guard" else row for kind, row in rows))
+
     def _remember(self, state: WatchState, ctx: TriggerContext, fired: bool) -> WatchState:
         rows = zip(self.leaves, state.standings, strict=True)
         return WatchState(
