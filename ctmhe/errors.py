@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from ctmhe.simulation.run import Run
+from typing import Any
 
 
 class CtmheError(Exception):
@@ -17,7 +14,7 @@ class CtmheError(Exception):
         What there was of a simulated run when it failed; None elsewhere.
     """
 
-    run: Run | None = None
+    run: Any = None
 
 
 class InputError(CtmheError, ValueError):

@@ -6,9 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 from ctmhe.errors import InputError
-from ctmhe.studies.reproduce import thesis_3_4_1_ct
+from ctmhe.studies.reproduce import study_reactor_budget, study_solves_saved, thesis_3_4_1_ct
 
-CASES: dict[str, Callable[..., dict[str, Any]]] = {"thesis-3.4.1-ct": thesis_3_4_1_ct.reproduce}
+CASES: dict[str, Callable[..., dict[str, Any]]] = {
+    "thesis-3.4.1-ct": thesis_3_4_1_ct.reproduce,
+    "study-reactor-budget": study_reactor_budget.reproduce,
+    "study-solves-saved": study_solves_saved.reproduce,
+}
 
 
 def reproduce(case: str, **options: Any) -> dict[str, Any]:

@@ -38,7 +38,7 @@ FAMILIES: dict[str, tuple[Callable[[float], Trigger], tuple[float, float]]] = {
     "send-on-area": (SendOnArea, (1e-4, 0.5)),
     "innovation": (Innovation, (0.01, 2.0)),
     "innovation energy": (lambda alpha: InnovationEnergy(alpha, eta=ETA, R=R), (1e-4, 10.0)),
-    "covariance": (CovarianceBound, (1e-3, 1.0)),
+    "covariance": (CovarianceBound, (0.05, 5.0)),
 }
 """Event-triggered policies by name: how they are made of a threshold, and where to look for one."""
 
