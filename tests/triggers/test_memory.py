@@ -39,7 +39,7 @@ CHANGES = {
     "dict updated": ({"n": 0}, lambda m: m.update(n=1)),
     "list": ([1], lambda m: m.append(2)),
     "list entry": ([1], lambda m: exec("m[0] = 2", {"m": m})),
-    "list extended": ([1], lambda m: m + [2]),
+    "list extended": ([1], lambda m: m.__add__([2])),
     "set": ({1}, lambda m: m.add(2)),
     "array inside": ({"rows": [np.zeros(2)]}, lambda m: m["rows"][0].__setitem__(0, 1.0)),
     "tuple of dicts": (({"n": 0},), lambda m: exec("m[0]['n'] = 1", {"m": m})),
