@@ -53,8 +53,8 @@ def test_innovation_energy_begins_anew_with_every_sample():
 
 
 def test_stochastic_sampling_has_the_probability_of_its_formula():
-    """Of 4000 questions, a share of 1 - exp(-Y e^2 / 2) is answered by yes, within four standard deviations."""
-    policy, n = Stochastic(Y=2.0), 4000
+    """Of 2000 questions, a share of 1 - exp(-Y e^2 / 2) is answered by yes, within four standard deviations."""
+    policy, n = Stochastic(Y=2.0), 2000
     for error in (0.0, 0.3, 1.0):
         ctx = context(y=[error], y_hat=[0.0], seed=3)
         share = sum(policy.fires(at(ctx, state=k)) for k in range(n)) / n
