@@ -42,18 +42,18 @@ class TokenBucket(Trigger):
             raise InputError(f"TokenBucket: burst must be >= 1, or no token ever fits in; got {self.burst:g}")
 
     def guard(self, ctx: TriggerContext) -> float:
-        """Return the number of tokens above one."""
-        return self._tokens(ctx) - 1.0
+        """Return the number of tokens above one, as if the bucket had no rim: a level that stops at 0 has no root."""
+        return self._grown(ctx) - 1.0
 
     def update(self, ctx: TriggerContext, fired: bool) -> Any:
         """Keep when a token was last taken and how many were left; None as long as the bucket is full."""
-        return (ctx.t, self._tokens(ctx) - 1.0) if fired else ctx.state
+        return (ctx.t, min(self.burst, self._grown(ctx)) - 1.0) if fired else ctx.state
 
-    def _tokens(self, ctx: TriggerContext) -> float:
+    def _grown(self, ctx: TriggerContext) -> float:
         if ctx.state is None:
             return self.burst
         since, left = ctx.state
-        return min(self.burst, left + self.rate * (ctx.t - since))
+        return left + self.rate * (ctx.t - since)
 
 
 @dataclass(frozen=True, repr=False)
@@ -116,6 +116,8 @@ class Budget(Or):
     """
 
     def __init__(self, policy: Trigger, samples: int, until: float, *, start: float = 0.0, freedom: float = 2.0):
+        if not isinstance(policy, Trigger):
+            raise InputError(f"Budget: {policy!r} is not a Trigger; decorate a function with @trigger, call a class")
         self.policy = policy
         self.samples = whole(samples, "Budget: samples", least=1)
         self.until, self.start = finite_time(until, "Budget: until"), finite_time(start, "Budget: start")

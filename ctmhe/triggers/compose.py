@@ -137,7 +137,8 @@ class Hysteresis(Trigger):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "release", positive(self.release, "Hysteresis: release", zero=True))
-        if isinstance(self.policy, Combined) or kind_of(self.policy) != "guard":
+        joined = isinstance(self.policy, Combined) or not isinstance(self.policy, Trigger)
+        if joined or kind_of(self.policy) != "guard":
             raise InputError(
                 f"Hysteresis: expected one policy with a guard, got {self.policy!r}; wrap the guards inside | and & "
                 "one by one"

@@ -79,22 +79,27 @@ class CovarianceSelfTriggered(Trigger):
         One state or estimated parameter, or a weighted sum. Left out: the largest deviation of all.
     longest : float
         Longest wait in seconds, whatever the deviation.
-    shortest : float
-        Shortest wait in seconds, > 0; the wait where a sample leaves the deviation above the bound.
+    shortest : float, optional
+        Shortest wait in seconds, > 0, which follows a sample that leaves the deviation above the bound; a hundredth of
+        `longest` when left out.
     """
 
     bound: float
     combination: Combination = None
     longest: float = field(kw_only=True)
-    shortest: float = field(default=1e-3, kw_only=True)
+    shortest: float | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         what = "CovarianceSelfTriggered"
-        for name in ("bound", "longest", "shortest"):
+        for name in ("bound", "longest"):
             object.__setattr__(self, name, positive(getattr(self, name), f"{what}: {name}"))
         object.__setattr__(self, "combination", checked(self.combination, what))
-        if self.shortest > self.longest:
-            raise InputError(f"{what}: shortest must not exceed longest, got {self.shortest:g} and {self.longest:g}")
+        if self.shortest is not None:
+            object.__setattr__(self, "shortest", positive(self.shortest, f"{what}: shortest"))
+            if self.shortest > self.longest:
+                raise InputError(
+                    f"{what}: shortest must not exceed longest of {self.longest:g} s, got {self.shortest!r}"
+                )
 
     def init_state(self) -> Any:
         """Return the number of samples in a row that left the deviation infinite."""
@@ -114,7 +119,8 @@ class CovarianceSelfTriggered(Trigger):
 
         if ctx.samples == 0 and above(0.0) >= 0:
             return ctx.t
-        before, wait = 0.0 if ctx.samples == 0 else self.shortest, self.shortest
+        shortest = self.longest / 100 if self.shortest is None else self.shortest
+        before, wait = 0.0 if ctx.samples == 0 else shortest, shortest
         while wait < self.longest and above(wait) < 0:
             before, wait = wait, min(2 * wait, self.longest)
         if wait > before and above(wait) >= 0 > above(before):

@@ -1,7 +1,6 @@
 """Elementary policies: what they answer, and what happens when they answer nonsense."""
 
 import pickle
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -17,42 +16,12 @@ from ctmhe.triggers import (
     Scheduled,
     SendOnDelta,
     Trigger,
-    TriggerContext,
     Watch,
     build_trigger,
     load_trigger,
     trigger,
 )
-from ctmhe.types import frozen
-
-
-@dataclass(frozen=True, eq=False)
-class Foreseen:
-    """An outlook that stays as it is."""
-
-    y: np.ndarray
-
-    def state(self, t):
-        return frozen([0.0])
-
-    def output(self, t):
-        return self.y
-
-    def covariance(self, t):
-        return frozen([[1.0]])
-
-
-def context(t=1.0, y=(0.0,), y_last=(0.0,), samples=1, y_hat=None, **more):
-    """Build a context with outputs a, b, ... and prediction `y_hat`."""
-    prediction = None if y_hat is None else Foreseen(frozen(y_hat))
-    names = tuple("abcdef"[: len(y)])
-    return TriggerContext(t, frozen(y), frozen(y_last), samples=samples, outputs=names, forecast=prediction, **more)
-
-
-def level(policy, ctx):
-    """Return the level of a policy that was just started at `ctx`."""
-    watch = Watch(policy)
-    return watch.level(watch.ask(watch.start(ctx), ctx), ctx)
+from tests.triggers.walking import context, level
 
 
 @given(st.floats(-5, 5), st.floats(-5, 5), st.floats(0, 3))
