@@ -21,6 +21,7 @@ from ctmhe.simulation import (
     replay,
     simulate,
 )
+from ctmhe.studies import Study, StudyResult, latin_hypercube, sobol
 from ctmhe.transcription import CVODES, RK4
 from ctmhe.triggers import (
     Innovation,
@@ -76,6 +77,8 @@ __all__ = [
     "SingleSample",
     "State",
     "Status",
+    "Study",
+    "StudyResult",
     "TooLate",
     "Trajectory",
     "Trigger",
@@ -84,7 +87,9 @@ __all__ = [
     "Uniform",
     "WholeSignal",
     "check_fmu",
+    "latin_hypercube",
     "replay",
     "simulate",
+    "sobol",
     "trigger",
 ]

@@ -1,0 +1,320 @@
+"""Where runs are computed: in this process, in processes of our own, or by an executor that was given.
+
+What every run needs, the case and the values of its parameters, is pickled once (`Book`) and kept by every worker; a
+task is a few numbers. A worker that does not know the book yet says so and is asked again, with the book.
+"""
+
+from __future__ import annotations
+
+import logging
+import pickle
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from dataclasses import dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from ctmhe.errors import InputError, MissingExtra
+from ctmhe.studies.design import Design, named
+from ctmhe.studies.metrics import Value, read_answer
+from ctmhe.studies.store import replacing
+from ctmhe.studies.trajectories import write_trajectory
+
+log = logging.getLogger(__name__)
+
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
+GIVEN_WIDTH = 1000
+"""Tasks that are handed to a cluster at a time, so that a cluster that grows with its queue has reason to."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A run to do: position of its point in the design, seed, and the file for its trajectory, if it is kept."""
+
+    key: str
+    point: int
+    seed: int
+    trajectory: str | None = None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of a run: metrics, error ("" for none), wall-clock seconds."""
+
+    values: dict[str, Value]
+    error: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Book:
+    """A case and its points, pickled once; `digest` is how workers know it."""
+
+    digest: str
+    content: bytes
+
+    @classmethod
+    def of(cls, case: Callable[..., Any], design: Design) -> Book:
+        """Pickle a case and the points of a design.
+
+        Raises
+        ------
+        InputError
+            Naming the case or the value that cannot be pickled, and why.
+        """
+        try:
+            from cloudpickle import dumps
+        except ImportError:
+            raise MissingExtra("cloudpickle", "study", "running a study in other processes") from None
+
+        try:
+            content = dumps((case, design.values))
+        except Exception as error:
+            raise _culprit(case, design, dumps) or InputError(f"study: the case cannot be pickled: {error}") from error
+        return cls(sha256(content).hexdigest(), content)
+
+
+def perform(case: Callable[..., Any], point: dict[str, Any], task: Task) -> Outcome:
+    """Do a run; whatever it raises becomes its error."""
+    start = time.perf_counter()
+    try:
+        run, values = read_answer(case(seed=task.seed, **point))
+        if task.trajectory is not None:
+            if run is None:
+                raise InputError("the case returned no Run: there is no trajectory to keep")
+            with replacing(Path(task.trajectory)) as temporary:
+                write_trajectory(run, temporary)
+        return Outcome(values, "", time.perf_counter() - start)
+    except (Exception, SystemExit) as error:
+        log.debug("a run failed", exc_info=True)
+        return Outcome({}, f"{type(error).__name__}: {error}", time.perf_counter() - start)
+
+
+def execute(
+    case: Callable[..., Any],
+    design: Design,
+    tasks: Sequence[Task],
+    *,
+    workers: int = 1,
+    executor: Any = None,
+) -> Iterator[tuple[Task, Outcome]]:
+    """Do runs and yield their outcomes as they come.
+
+    A run whose process dies is tried once more, alone, when the others are done; if it dies again, that is its error.
+
+    Parameters
+    ----------
+    workers : int
+        1: in this process; more: that many processes of our own (joblib's loky), one BLAS thread each.
+    executor : concurrent.futures.Executor or dask.distributed.Client, optional
+        In place of our own processes.
+    """
+    if executor is None and workers == 1:
+        points = list(design)
+        for task in tasks:
+            yield task, perform(case, points[task.point], task)
+        return
+    book = Book.of(case, design)
+    if executor is None:
+        pool: _Pool = _Processes(min(workers, len(tasks)))
+    elif hasattr(executor, "get_executor"):
+        pool = _Dask(executor)
+    else:
+        pool = _Given(executor, workers)
+    try:
+        yield from _spread(design.parameters, book, tasks, pool)
+    finally:
+        pool.close()
+
+
+def _spread(
+    parameters: tuple[str, ...], book: Book, tasks: Sequence[Task], pool: _Pool
+) -> Iterator[tuple[Task, Outcome]]:
+    queue, suspects = deque(tasks), deque[Task]()
+    running: dict[Future[Any], Task] = {}
+    broken = False
+
+    def start(task: Task, content: Any) -> None:
+        future = pool.submit(_work, book.digest, content, parameters, task)
+        running[future] = task
+
+    while queue or suspects or running:
+        alone = not queue and bool(suspects)
+        try:
+            while queue and not broken and len(running) < pool.width:
+                start(queue[0], pool.content(book))
+                queue.popleft()
+            if alone and not running and not broken:
+                start(suspects[0], book.content)
+        except BrokenExecutor:  # died meanwhile
+            broken = True
+        if running:
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                task = running.pop(future)
+                try:
+                    outcome = future.result()
+                except Exception as error:
+                    if not _died(error):
+                        raise
+                    broken = broken or isinstance(error, BrokenExecutor)
+                    if suspects and task is suspects[0]:
+                        suspects.popleft()
+                        yield task, Outcome({}, f"the worker process died: {_first_line(error)}", float("nan"))
+                    else:
+                        log.warning("a worker process died; its runs are tried again, one at a time")
+                        suspects.append(task)
+                    continue
+                if outcome is None:  # the worker does not know the book yet
+                    try:
+                        start(task, book.content)
+                    except BrokenExecutor:
+                        broken = True
+                        suspects.append(task)
+                    continue
+                if suspects and task is suspects[0]:
+                    suspects.popleft()
+                yield task, outcome
+        if broken and not running:
+            pool.renew()
+            broken = False
+
+
+_KNOWN = threading.local()
+"""The book that this worker knows. One, so that a worker that serves many studies does not grow; and each thread has
+its own, since plants are no values: two runs must not share one at a time."""
+
+
+def _work(digest: str, content: Any, parameters: tuple[str, ...], task: Task) -> Outcome | None:
+    """Do a run in a worker; return None when the book is needed first."""
+    if getattr(_KNOWN, "digest", None) != digest:
+        if content is None:
+            return None
+        try:
+            _KNOWN.digest, _KNOWN.book = None, None
+            _KNOWN.book = pickle.loads(content)
+            _KNOWN.digest = digest
+        except Exception as error:
+            raise InputError(
+                f"study: a worker cannot load the case: {type(error).__name__}: {error}. It needs the "
+                "same packages, and the module of the case"
+            ) from error
+    case, values = _KNOWN.book
+    return perform(case, dict(zip(parameters, values[task.point], strict=True)), task)
+
+
+class _Pool:
+    """Where tasks are submitted to; `width` of them at a time."""
+
+    width: int
+    executor: Executor
+
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> Future[Any]:
+        """Start a task."""
+        return self.executor.submit(function, *arguments)
+
+    def content(self, book: Book) -> Any:
+        """Return the book as it goes with a first attempt."""
+        return None
+
+    def renew(self) -> None:
+        """Replace what a dying process has broken."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Stop what is still running."""
+
+
+class _Processes(_Pool):
+    """Processes of our own."""
+
+    def __init__(self, workers: int):
+        self.workers, self.width = workers, 2 * workers
+        self.executor = self._open()
+
+    def _open(self) -> Executor:
+        try:
+            from joblib.externals.loky import ProcessPoolExecutor
+        except ImportError:
+            raise MissingExtra("joblib", "study", "running a study on several workers") from None
+        return ProcessPoolExecutor(max_workers=self.workers, timeout=300, env=ONE_THREAD)  # pyright: ignore
+
+    def renew(self) -> None:
+        self.close()
+        self.executor = self._open()
+
+    def close(self) -> None:
+        self.executor.shutdown(wait=True, kill_workers=True)  # pyright: ignore
+
+
+class _Given(_Pool):
+    """An executor of the user's; when it breaks, processes of our own take over."""
+
+    def __init__(self, executor: Executor, workers: int):
+        self.executor, self.own = executor, None
+        self.workers = getattr(executor, "_max_workers", None) or max(workers, 2)
+        self.width = 2 * self.workers
+
+    def renew(self) -> None:
+        if self.own is None:
+            log.warning("the executor is broken; the study goes on in %d processes of its own", self.workers)
+            self.own = _Processes(self.workers)
+        else:
+            self.own.renew()
+        self.executor = self.own.executor
+
+    def close(self) -> None:
+        if self.own is not None:
+            self.own.close()
+
+
+class _Dask(_Pool):
+    """A Dask client: the book is a task of its own, whose result workers fetch from each other, once each."""
+
+    width = GIVEN_WIDTH
+
+    def __init__(self, client: Any):
+        self.client, self.executor, self.known = client, client.get_executor(pure=False), None
+
+    def content(self, book: Book) -> Any:
+        if self.known is None:
+            self.known = self.client.submit(bytes, book.content, key=f"ctmhe-study-{book.digest}")
+        return self.known
+
+    def renew(self) -> None:
+        self.executor = self.client.get_executor(pure=False)
+
+    def close(self) -> None:
+        self.executor.shutdown(wait=False)
+        self.known = None
+
+
+def _died(error: Exception) -> bool:
+    """Return whether an error means that the process died that did the run; KilledWorker is Dask's word for it."""
+    return isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"
+
+
+def _first_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:300] or type(error).__name__
+
+
+def _culprit(case: Callable[..., Any], design: Design, dumps: Callable[[Any], bytes]) -> InputError | None:
+    """Return an error that names what cannot be pickled."""
+    parts = [("the case", case)]
+    for labels, values in zip(design.labels, design.values, strict=True):
+        parts += [
+            (named([name], [label]), value)
+            for name, label, value in zip(design.parameters, labels, values, strict=True)
+        ]
+    for what, part in parts:
+        try:
+            dumps(part)
+        except Exception as error:
+            return InputError(
+                f"study: {what} cannot be sent to another process: {type(error).__name__}: {error}. Make what it holds "
+                "(open files, locks, generators) inside the case, or run with workers=1"
+            )
+    return None
