@@ -2,9 +2,22 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ctmhe.simulation.run import Run
+
 
 class CtmheError(Exception):
-    """Base of every error that this library raises on purpose."""
+    """Base of every error that this library raises on purpose.
+
+    Attributes
+    ----------
+    run : Run or None
+        What there was of a simulated run when it failed; None elsewhere.
+    """
+
+    run: Run | None = None
 
 
 class InputError(CtmheError, ValueError):

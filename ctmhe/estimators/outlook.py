@@ -23,7 +23,7 @@ def prior_covariance(assembly: Assembly, t: float) -> Array:
 def carried_covariance(
     stage: StageFunction, assembly: Assembly, mesh: Mesh, u0: Array, u1: Array, x: Array, p: Array, covariance: Array
 ) -> Array:
-    """Return the covariance of (x, estimated p) (n, n) at the end of a mesh, from (x, p) with `covariance` at its start.
+    """Return the covariance (n, n) of (x, estimated p) at the end of a mesh, from `covariance` at its start.
 
     Along the open loop P(k+1) = A P(k) A' / eta^h + B Q_k^-1 B', where A and B are the Jacobians of a slot of h seconds
     and Q_k is Q times the discounted length of the slot: the inverse Hessian of the cost at the end when no output is

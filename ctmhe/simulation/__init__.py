@@ -3,6 +3,7 @@
 from ctmhe.simulation.channel import Channel, Delivery, Everything, Link, SingleSample, WholeSignal
 from ctmhe.simulation.fmu import Checkup, FmuPlant, check_fmu
 from ctmhe.simulation.loop import simulate
+from ctmhe.simulation.network import Network
 from ctmhe.simulation.plants import MapPlant, OdePlant, Plant
 from ctmhe.simulation.replay import replay
 from ctmhe.simulation.run import Run
@@ -17,6 +18,7 @@ __all__ = [
     "Gaussian",
     "Link",
     "MapPlant",
+    "Network",
     "OdePlant",
     "Plant",
     "Recorded",

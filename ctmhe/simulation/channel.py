@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
+
+import numpy as np
 
 from ctmhe.errors import InputError
 from ctmhe.triggers.compose import positive
@@ -12,14 +14,27 @@ from ctmhe.types import Array, Measurement
 
 @dataclass(frozen=True, eq=False)
 class Delivery:
-    """A measurement on its way: it reaches the estimator at time `at` (seconds)."""
+    """A measurement on its way: it reaches the estimator at time `at` (seconds), never when that is inf.
+
+    `bytes` is what it takes on the way: by default 8 for its time and 8 for each value in it.
+    """
 
     at: float
     measurement: Measurement
+    bytes: int = 0
+
+    @classmethod
+    def of(cls, t: float, y: Array, value_bytes: int = 8) -> Delivery:
+        """Return what arrives at once."""
+        return cls(t, Measurement(t, y), 8 + value_bytes * int(np.count_nonzero(~np.isnan(y))))
 
 
 class Link(Protocol):
-    """One run's end of a channel; it may hold back, drop or change what it is given."""
+    """One run's end of a channel; it may hold back, drop or change what it is given.
+
+    What one call returns is one message. Without any at a sample, the estimator solves with what it has; else when
+    the message arrives.
+    """
 
     def record(self, t: float, y: Array) -> list[Delivery]:
         """Take a routine record of the sensors at time `t`; return what is put on the way."""
@@ -34,8 +49,14 @@ class Channel(Protocol):
     """A way for measurements from sensor to estimator; immutable, one `Link` a run.
 
     `holds` are the kinds of measurement (`MHE(hold=)`) that it delivers: "zero" and "linear" mean a signal known
-    between its records, "point" single values.
+    between its records, "point" single values. `faithful` tells whether all that is sent arrives at once, unchanged:
+    where not, the trigger sees the estimates of a copy of the estimator, which knows what was sent.
     """
+
+    @property
+    def faithful(self) -> bool:
+        """Return whether all that is sent arrives at once, unchanged."""
+        ...
 
     @property
     def holds(self) -> tuple[str, ...]:
@@ -46,8 +67,8 @@ class Channel(Protocol):
         """Return the seconds between routine records, None for none; `monitor` is the monitoring step."""
         ...
 
-    def open(self, seed: int) -> Link:
-        """Return the link of a new run."""
+    def open(self, seed: int, outputs: tuple[str, ...]) -> Link:
+        """Return the link of a new run, for outputs of these names."""
         ...
 
 
@@ -70,6 +91,11 @@ class WholeSignal:
         _check_every(self)
 
     @property
+    def faithful(self) -> bool:
+        """True: what is sent arrives at once."""
+        return True
+
+    @property
     def holds(self) -> tuple[str, ...]:
         """A signal known between its records."""
         return ("zero", "linear")
@@ -78,7 +104,7 @@ class WholeSignal:
         """Return the seconds between records."""
         return self.every or monitor
 
-    def open(self, seed: int) -> Link:
+    def open(self, seed: int, outputs: tuple[str, ...]) -> Link:
         """Return a link with an empty buffer."""
         return _Buffer()
 
@@ -86,6 +112,11 @@ class WholeSignal:
 @dataclass(frozen=True)
 class SingleSample:
     """One value of every sensor, at the event; for `hold="point"`. What a network of smart sensors sends."""
+
+    @property
+    def faithful(self) -> bool:
+        """True: what is sent arrives at once."""
+        return True
 
     @property
     def holds(self) -> tuple[str, ...]:
@@ -96,7 +127,7 @@ class SingleSample:
         """Return None: there are no routine records."""
         return None
 
-    def open(self, seed: int) -> Link:
+    def open(self, seed: int, outputs: tuple[str, ...]) -> Link:
         """Return a link that passes on samples."""
         return _Through(records=False, samples=True)
 
@@ -117,6 +148,11 @@ class Everything:
         _check_every(self)
 
     @property
+    def faithful(self) -> bool:
+        """True: what is sent arrives at once."""
+        return True
+
+    @property
     def holds(self) -> tuple[str, ...]:
         """A signal known between its records."""
         return ("zero", "linear")
@@ -125,7 +161,7 @@ class Everything:
         """Return the seconds between records."""
         return self.every or monitor
 
-    def open(self, seed: int) -> Link:
+    def open(self, seed: int, outputs: tuple[str, ...]) -> Link:
         """Return a link that passes on records."""
         return _Through(records=True, samples=False)
 
@@ -145,17 +181,17 @@ def check_hold(channel: Channel, hold: object, outputs: tuple[str, ...]) -> None
 
 class _Buffer:
     def __init__(self) -> None:
-        self.kept: list[Measurement] = []
+        self.kept: list[tuple[float, Array]] = []
 
     def record(self, t: float, y: Array) -> list[Delivery]:
-        self.kept.append(Measurement(t, y))
+        self.kept.append((t, y))
         return []
 
     def sample(self, t: float, y: Array) -> list[Delivery]:
-        if not self.kept or self.kept[-1].t != t:
-            self.kept.append(Measurement(t, y))
+        if not self.kept or self.kept[-1][0] != t:
+            self.kept.append((t, y))
         sent, self.kept = self.kept, []
-        return [Delivery(t, measurement) for measurement in sent]
+        return [replace(Delivery.of(*item), at=t) for item in sent]
 
 
 class _Through:
@@ -163,10 +199,10 @@ class _Through:
         self.records, self.samples = records, samples
 
     def record(self, t: float, y: Array) -> list[Delivery]:
-        return [Delivery(t, Measurement(t, y))] if self.records else []
+        return [Delivery.of(t, y)] if self.records else []
 
     def sample(self, t: float, y: Array) -> list[Delivery]:
-        return [Delivery(t, Measurement(t, y))] if self.samples else []
+        return [Delivery.of(t, y)] if self.samples else []
 
 
 def _check_every(channel: WholeSignal | Everything) -> None:

@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from ctmhe.errors import InputError, TooLate, TriggerError
+from ctmhe.errors import CtmheError, FmuUnsupportedError, InputError, TriggerError
 from ctmhe.estimators.mhe import MHE
 from ctmhe.models.signals import Signals
 from ctmhe.simulation.channel import Channel, Delivery, check_hold
 from ctmhe.simulation.drivers import Driver
+from ctmhe.simulation.follower import Follower
+from ctmhe.simulation.location import first_reached
 from ctmhe.simulation.plants import Plant
 from ctmhe.simulation.recorder import Recorder
 from ctmhe.simulation.run import Run
 from ctmhe.triggers.base import Trigger, TriggerContext
 from ctmhe.triggers.timing import tolerance
 from ctmhe.triggers.watch import Watch, WatchState
-from ctmhe.types import Array, Estimate, Input, frozen
+from ctmhe.types import Array, Input, frozen
 
-LOCATED = 1e-11
-"""Seconds to which an event is located between monitoring times."""
+logger = logging.getLogger(__name__)
 
 MOST_SAMPLES = 1000
 """Samples within one monitoring step beyond which a policy is taken to run away."""
@@ -30,62 +33,24 @@ MOST_SAMPLES = 1000
 MOST_SHORT_GAPS = 10
 """Consecutive samples at the smallest gap beyond which a policy is taken to run away."""
 
-CLIP = 1e12
-
 
 @dataclass
 class Progress:
-    """What changes while a loop runs."""
+    """What changes while a loop runs, beside the estimators."""
 
     t: float
-    state: Any
     watch: WatchState
     y_last: Array
     last_event: float
-    estimate: Estimate | None = None
     samples: int = 0
-    base: tuple[float, Array, Array] = (0.0, np.empty(0), np.empty(0))
     told: Array | None = None
-    pending: list[Delivery] = field(default_factory=list)
-    measurements: int = 0
-    too_late: int = 0
+    records: list[Delivery] = field(default_factory=list)
+    messages: list[list[Delivery]] = field(default_factory=list)
+    sent: int = 0
+    lost: int = 0
+    bytes: int = 0
     in_step: int = 0
     short_gaps: int = 0
-
-
-class Forecast:
-    """What is expected from the last estimate on; computed when asked, kept for the last time asked for."""
-
-    def __init__(self, mhe: MHE, now: Progress):
-        self.mhe, self.estimator, self.base, self.estimate = mhe, now.state, now.base, now.estimate
-        self.known: dict[str, tuple[float, Array]] = {}
-
-    def state(self, t: float) -> Array:
-        """Return the predicted state at `t`."""
-
-        def compute() -> Array:
-            t0, x0, p = self.base
-            return x0 if t <= t0 else self.mhe.propagate(self.estimator, t0, t, x0, p)
-
-        return self._kept("state", t, compute)
-
-    def output(self, t: float) -> Array:
-        """Return the predicted output at `t`."""
-        return self._kept("output", t, lambda: self.mhe.output(self.estimator, t, self.state(t), self.base[2]))
-
-    def covariance(self, t: float) -> Array:
-        """Return the predicted covariance at `t`."""
-        return self._kept("covariance", t, lambda: self._covariance(t))
-
-    def _covariance(self, t: float) -> Array:
-        state = self.estimator
-        known = self.mhe.prior_covariance(state.t) if self.estimate is None else self.estimate.covariance
-        return self.mhe.propagate_covariance(state, state.t, t, state.x, state.p, known)
-
-    def _kept(self, name: str, t: float, compute: Callable[[], Array]) -> Array:
-        if name not in self.known or self.known[name][0] != t:
-            self.known[name] = (t, frozen(compute()))
-        return self.known[name][1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +85,7 @@ class Loop:
         times: Array,
         monitor: float,
         seed: int,
-        locate: bool,
+        locate: float | None,
         sample_time: Callable[[], float] | None = None,
     ):
         self.plant, self.mhe, self.model = plant, mhe, mhe.model
@@ -131,32 +96,51 @@ class Loop:
             check_hold(channel, mhe.hold, self.model.y.names)
         self.y_map = matched(self.model.y, plant.y, "plant", plant.name)
         self.u_map = matched(self.model.u, plant.u, "plant", plant.name)
-        self.channel, self.link = channel, channel.open(seed)
+        self.channel, self.link = channel, channel.open(seed, self.model.y.names)
         self.sample_time = sample_time
         step = channel.interval(monitor)
         self.recording, self.record_step = step is not None, step if sample_time is None else None
         self.disturbance, self.inputs = disturbance, inputs
         self.times, self.monitor, self.seed = times, monitor, seed
-        self.locate = locate and self.watch.has_guard
+        self.locate = locate if self.watch.has_guard else None
+        self.rooted = self.locate is not None and getattr(plant, "finds_roots", False)
         self.parameters = self.model.p.names if mhe.assembly.p_estimated else ()
         self.recorder = Recorder(self)
 
     def run(self, *, truth: Any, p_true: Any, guess: Any, p: Any, progress: bool) -> Run:
-        """Go through the monitoring times and return what was recorded."""
+        """Go through the monitoring times and return what was recorded; an error carries what there was until then."""
         plant, start = self.plant, float(self.times[0])
         x = truth if truth is None else plant.x.vector(truth, "truth")
         plant.start(start, x, p_true)
-        state = self.mhe.init(t=start, x=guess, p=p)
+        self._check_way_back()
+        self.estimator = Follower(self.mhe, self.mhe.init(t=start, x=guess, p=p))
+        self.sensor = self.estimator if self.channel.faithful else Follower(self.mhe, self.estimator.state)
         unsent = frozen(np.full(len(self.model.y), np.nan))
-        self.now = Progress(start, state, WatchState(()), unsent, start)
-        self.now.base = (start, state.x, state.p)
+        self.now = Progress(start, WatchState(()), unsent, start)
         self.segment = self._segment(self._after(0))
         crossed = False
-        for k in steps_of(self.times, progress):
-            self._visit(grid=k, crossed=crossed)
-            if k + 1 < len(self.times):
-                crossed = self._go_to(float(self.times[k + 1]), self._after(k + 1))
+        try:
+            for k in steps_of(self.times, progress):
+                self._visit(grid=k, crossed=crossed)
+                if k + 1 < len(self.times):
+                    crossed = self._go_to(float(self.times[k + 1]), self._after(k + 1))
+        except CtmheError as error:
+            error.run = self.recorder.finish(p_true)
+            raise
+        if not self.now.samples:
+            logger.warning("policy %r never fired from %g s to %g s", self.watch.policy, start, self.now.t)
         return self.recorder.finish(p_true)
+
+    def _check_way_back(self) -> None:
+        """Raise when events are to be located by going back, and the plant cannot."""
+        if self.locate is None or self.rooted:
+            return
+        try:
+            self.plant.checkpoint()
+        except FmuUnsupportedError as error:
+            raise FmuUnsupportedError(
+                f"{error} Or ask policy {self.watch.policy!r} at monitoring times only: locate=None"
+            ) from error
 
     def _after(self, k: int) -> float:
         """Return the monitoring time after number `k` (one step on, after the last)."""
@@ -167,10 +151,13 @@ class Loop:
         t = self.now.t
         slack = tolerance(t)
         sources = (self.disturbance.next_jump, self.inputs.next_jump, self._next_record, self.now.watch.next_due)
-        b = min(source(t + slack) for source in sources)
+        b = min(source(t + slack) for source in (*sources, self._next_arrival))
         b = end if b > end - slack else b
         u0, u1 = self.inputs.segment(t, b)
         return Segment(t, b, u0, u1, self.disturbance.segment(t, b)[0])
+
+    def _next_arrival(self, t: float) -> float:
+        return min((message[0].at for message in self.now.messages if message[0].at > t), default=np.inf)
 
     def _next_record(self, t: float) -> float:
         step = self.record_step
@@ -189,24 +176,43 @@ class Loop:
         """
         while True:
             segment = self.segment
-            before = self.plant.checkpoint() if self.locate else None
-            self.plant.advance(segment.b, segment.u0, segment.u1, segment.w)
-            crossed = self.locate and self._level_in(segment, segment.b) >= 0
-            if crossed:
-                at = self._located(segment, before)
-                if at < segment.b - tolerance(at):
-                    self._advance_from(before, segment, at)
-                    self.now.t = at
-                    u = segment.input_at(at)
-                    self._tell(u)
-                    self._event(self._context(at, self._measure(u, segment.w)))
-                    self.segment = self._segment(end)
-                    continue
+            at, crossed = self._advance(segment)
+            if at < segment.b:
+                self.now.t = at
+                u = segment.input_at(at)
+                self._tell(u)
+                self._event(self._context(at, self._measure(u, segment.w)))
+                self.segment = self._segment(end)
+                continue
             self.now.t = segment.b
             self.segment = self._segment(after if segment.b >= end else end)
             if segment.b >= end:
                 return crossed
             self._visit(crossed=crossed)
+
+    def _advance(self, segment: Segment) -> tuple[float, bool]:
+        """Advance to the segment's end, or to the event before; return the time, and whether a guard crossed there."""
+        plant, b = self.plant, segment.b
+        drive = (segment.u0, segment.u1, segment.w)
+        if self.locate is None:
+            plant.advance(b, *drive)
+            return b, False
+        if not self.rooted:
+            level = partial(self._level_in, segment)
+            return first_reached(plant, segment, level, self.locate, after=self._dead_until())
+        at = plant.advance_until(b, *drive, partial(self._level_of, segment))  # type: ignore[attr-defined]
+        if at < (dead := min(self._dead_until(), b)):
+            plant.advance(dead, segment.input_at(at), segment.input_at(dead), segment.w)
+            at = dead
+        if at >= b - tolerance(b):
+            plant.advance(b, segment.input_at(at), segment.u1, segment.w)
+            return b, self._level_in(segment, b) >= 0
+        return at, True
+
+    def _dead_until(self) -> float:
+        """Return the earliest time of another sample: no two within what counts as one instant."""
+        now = self.now
+        return now.last_event + tolerance(now.last_event) if now.samples else -np.inf
 
     def _visit(self, grid: int | None = None, crossed: bool = False) -> None:
         """Do what is due now: tell inputs, record, ask the policy, sample; keep results at monitoring time `grid`."""
@@ -214,33 +220,39 @@ class Loop:
         y = self._measure(segment.u0, segment.w)
         self._tell(segment.u0)
         if self._record_due(grid):
-            now.pending += self.link.record(now.t, y)
+            self._post(self.link.record(now.t, y), now.records)
+        self._arrive()
         ctx = self._context(now.t, y)
         if grid is not None:
             now.in_step = 0
             now.watch = self.watch.ask(self.watch.start(ctx) if grid == 0 else now.watch, ctx)
-        fired = crossed or self.watch.level(now.watch, ctx) >= 0
+        level = self.watch.level(now.watch, ctx)
+        fired = crossed or level >= 0
         if fired:
             self._event(ctx)
         elif grid is not None:
             now.watch = self.watch.monitored(now.watch, ctx)
         if fired or grid == 0:
             self.segment = self._segment(segment.b)  # policies may have named earlier times
-        self._deliver()
         if grid is not None:
-            if now.base[0] < now.t:
-                now.base = (now.t, ctx.prediction, now.base[2])
-            x_online = now.state.start[: len(self.model.x)] if grid == 0 else now.base[1]
-            self.recorder.monitored(grid, self.plant.state(), x_online, y, segment)
+            start = self.estimator.state.start[: len(self.model.x)]
+            for follower in {id(f): f for f in (self.estimator, self.sensor)}.values():
+                follower.carry(now.t)
+            x_online = start if grid == 0 else self.estimator.forecast.x
+            level = max(level, 0.0) if crossed else level
+            self.recorder.monitored(grid, self.plant.state(), x_online, y, level, segment)
 
     def _measure(self, u: Array, w: Array) -> Array:
         return frozen(np.asarray(self.plant.output(u, w))[self.y_map])
 
     def _tell(self, u: Array) -> None:
-        """Tell the estimator an input that changed."""
+        """Tell the estimators an input that changed."""
         now = self.now
         if len(self.model.u) and (now.told is None or not np.array_equal(u, now.told)):
-            now.state = self.mhe.control(now.state, Input(now.t, u[self.u_map]))
+            known = Input(now.t, u[self.u_map])
+            self.estimator.tell(known)
+            if self.sensor is not self.estimator:
+                self.sensor.tell(known)
             now.told = np.array(u)
 
     def _context(self, t: float, y: Array) -> TriggerContext:
@@ -254,73 +266,80 @@ class Loop:
             outputs=self.model.y.names,
             states=self.model.x.names,
             parameters=self.parameters,
-            estimate=now.estimate,
-            forecast=Forecast(self.mhe, now),
+            estimate=self.sensor.estimate,
+            forecast=self.sensor.forecast,
             seed=self.seed,
         )
 
     def _level_in(self, segment: Segment, t: float) -> float:
         """Return the level at `t` with the plant there, as seen from inside the segment: the left limit at its end."""
-        y = self._measure(segment.input_at(t), segment.w)
-        return self.watch.level(self.now.watch, self._context(t, y), as_of=segment.a)
+        return self._level(segment, t, self.plant.output(segment.input_at(t), segment.w))
 
-    def _advance_from(self, checkpoint: Any, segment: Segment, t: float) -> None:
-        self.plant.restore(checkpoint)
-        self.plant.advance(t, segment.u0, segment.input_at(t), segment.w)
+    def _level_of(self, segment: Segment, t: float, x: Array) -> float:
+        """Return the same for a plant that tells its output in another state."""
+        return self._level(segment, t, self.plant.output_at(t, x, segment.input_at(t), segment.w))  # type: ignore[attr-defined]
 
-    def _located(self, segment: Segment, checkpoint: Any) -> float:
-        """Return the first time found in the segment at which the level is >= 0, to `LOCATED` seconds."""
-
-        def level(t: float) -> float:
-            self._advance_from(checkpoint, segment, t)
-            return float(np.clip(self._level_in(segment, t), -CLIP, CLIP))
-
-        a, b = segment.a, segment.b
-        if level(b) < 0:
-            return b
-        a = a if level(a) < 0 else min(a + 2 * tolerance(a), b)
-        if level(a) >= 0:
-            at = a
-        else:
-            from scipy.optimize import brentq
-
-            at = float(brentq(level, a, b, xtol=LOCATED, rtol=4 * np.finfo(float).eps, maxiter=200))  # type: ignore[arg-type]
-            nudge = LOCATED
-            while at < b and level(at) < 0:
-                at, nudge = min(at + nudge, b), 2 * nudge
-        earliest = self.now.last_event + tolerance(at) if self.now.samples else a
-        if at >= b - tolerance(b):
-            level(b)
-            return b
-        return max(at, earliest)
+    def _level(self, segment: Segment, t: float, y: Array) -> float:
+        ctx = self._context(t, frozen(np.asarray(y)[self.y_map]))
+        return self.watch.level(self.now.watch, ctx, as_of=segment.a)
 
     def _event(self, ctx: TriggerContext) -> None:
-        """Sample now: send, deliver, solve, and let the policy plan anew."""
+        """Sample now: send, solve where it arrives, and let the policy plan anew."""
         now, y = self.now, ctx.y
         self._guard_against_zeno(now.t)
-        now.pending += self.link.sample(now.t if self.sample_time is None else self.sample_time(), y)
-        delivered = self._deliver()
-        now.state, now.estimate = self.mhe.estimate(now.state, now.t)
-        now.base = (now.t, now.state.x, now.state.p)
-        self.recorder.sampled(now.state, now.estimate, now.t, now.last_event, y, delivered)
+        message = self.link.sample(now.t if self.sample_time is None else self.sample_time(), y)
+        self.recorder.sampled(now.t, now.last_event, y)
         now.y_last = frozen(np.where(np.isnan(y), now.y_last, y))
         now.last_event, now.samples = now.t, now.samples + 1
+        if message:
+            self._post(message, now.messages)
+            self._arrive()
+        else:  # nothing is sent for a sample: it only means to solve
+            self._solve(self._take(now.records))
+        if self.sensor is not self.estimator:
+            self.sensor.solve(now.t)
         now.watch = self.watch.sampled(now.watch, ctx, self._context(now.t, y))
 
-    def _deliver(self) -> int:
-        """Hand the estimator what has arrived by now; return how many measurements it took."""
+    def _post(self, message: list[Delivery], queue: list[Any]) -> None:
+        """Put a message on the way, and let the copy at the sensor know what it says."""
         now = self.now
-        arrived = [item for item in now.pending if item.at <= now.t]
-        now.pending = [item for item in now.pending if item.at > now.t]
-        taken = 0
-        for item in sorted(arrived, key=lambda item: item.at):
-            try:
-                now.state = self.mhe.observe(now.state, item.measurement)
-                taken += 1
-            except TooLate:
-                now.too_late += 1
-        now.measurements += taken
-        return taken
+        if not message:
+            return
+        now.sent += 1
+        now.bytes += sum(item.bytes for item in message)
+        if self.sensor is not self.estimator:
+            self.sensor.observe(item.measurement for item in message)
+        if np.isinf(message[0].at):
+            now.lost += 1
+        elif queue is now.records:
+            queue.extend(message)
+        else:
+            queue.append(message)
+
+    def _arrive(self) -> None:
+        """Hand the estimator what has arrived by now, and let it solve when a sample's message is among it."""
+        now = self.now
+        until = now.t + tolerance(now.t)
+        due = [message for message in now.messages if message[0].at <= until]
+        now.messages = [message for message in now.messages if message[0].at > until]
+        taken = self._take(now.records)
+        for message in sorted(due, key=lambda message: message[0].at):
+            taken += self.estimator.observe(item.measurement for item in message)
+        if due:
+            self._solve(taken)
+
+    def _take(self, records: list[Delivery]) -> int:
+        """Hand the estimator the records that have arrived by now; return how many it took."""
+        until = self.now.t + tolerance(self.now.t)
+        arrived = sorted((item for item in records if item.at <= until), key=lambda item: item.at)
+        records[:] = [item for item in records if item.at > until]
+        return self.estimator.observe(item.measurement for item in arrived)
+
+    def _solve(self, taken: int) -> None:
+        """Estimate now, after `taken` new measurements."""
+        previous = self.estimator.state.t
+        estimate = self.estimator.solve(self.now.t)
+        self.recorder.solved(self.estimator.state, estimate, self.now.t, previous, taken)
 
     def _guard_against_zeno(self, t: float) -> None:
         """Raise when the policy samples without end."""

@@ -7,16 +7,23 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
 
-from ctmhe.errors import MissingExtra, SolverError
+from ctmhe.errors import CtmheError, MissingExtra, SolverError
 from ctmhe.models.continuous import Model
 from ctmhe.types import Array
 
 MAX_STEPS = 50_000
+
+MOST_ROOTS = 50
+"""Roots after which scikits.odes begins anew at the next restart: it keeps and copies all of them at every call."""
+
+CLIP = 1e12
+"""Largest magnitude of a level that CVODE is shown: +-inf mean a certain yes and no."""
 
 
 class Integration(Protocol):
@@ -31,6 +38,10 @@ class Integration(Protocol):
     def to(self, t: float) -> Array:
         """Return the state at `t`, which lies after the last time asked for."""
         ...
+
+
+Level = Callable[[float, Array], float]
+"""A trigger's level at a time (seconds), given the state (nx,)."""
 
 
 def has_sundials() -> bool:
@@ -77,7 +88,9 @@ class ScikitsCvode:
             old_api=False,
             err_handler=lambda *report: self._messages.append(_text(report[-1])),
         )
-        self._begun = False
+        self._begun = self._rooted = False
+        self._level: Level | None = None
+        self._roots = 0
         self._failure: Exception | None = None
 
     def restart(self, t: float, x: Array, u: Array, slope: Array, w: Array, p: Array) -> None:
@@ -86,28 +99,65 @@ class ScikitsCvode:
         self._clock, self._state = t, np.array(x)
         for buffered in (self._value, self._jacobian):
             buffered.w[:], buffered.p[:] = w, p
-        begin = self._solver.reinit_IC if self._begun else self._solver.init_step
-        self._begun = True
+        anew = not self._begun or self._roots > MOST_ROOTS
+        self._begun, self._roots = True, 0 if anew else self._roots
+        begin = self._solver.init_step if anew else self._solver.reinit_IC
         begin(0.0, np.array(x, dtype=np.float64))
 
     def to(self, t: float) -> Array:
         """Return the state at `t`; the solver keeps its order and step across calls."""
-        if t == self._clock:
-            return self._state
+        while t != self._clock:
+            self._go(t)
+        return self._state
+
+    def until(self, t: float, level: Level) -> tuple[float, Array]:
+        """Return the first time up to `t` at which `level` reaches zero from below, `t` if none, and the state there.
+
+        CVODE looks for it within each of its steps, to its own rounding; the time is as exact as the solution.
+        """
+        if not self._rooted:
+            self._solver.set_options(rootfn=self._root, nr_rootfns=1)
+            self._rooted = True
+        self._level = level
+        try:
+            while t != self._clock:
+                if self._go(t) and level(self._clock, self._state) >= 0:
+                    break
+        finally:
+            self._level = None
+        return self._clock, self._state
+
+    def _go(self, t: float) -> bool:
+        """Go on to `t`, or to a root; return whether it is a root."""
         result = self._solver.step(t - self._start)
-        if int(result.flag) < 0:
+        if self._failure is not None or int(result.flag) < 0:
+            failure, self._failure = self._failure, None
+            if isinstance(failure, CtmheError):  # a policy's, in its own words
+                raise failure
             reason = self._messages[-1] if self._messages else result.message
             self._messages.clear()
             raise SolverError(
                 f"{self.name} stopped between t = {self._clock:.9g} and {t:.9g}: {reason}. Check that the model makes "
                 "sense at the plant's state, inputs and disturbance there"
-            ) from self._failure
-        self._clock, self._state = t, np.array(result.values.y)
-        return self._state
+            ) from failure
+        root = result.flag.name == "ROOT_RETURN"
+        self._roots += root
+        self._clock = min(self._start + float(result.values.t), t) if root else t
+        self._state = np.array(result.values.y)
+        return root
 
     def _rhs(self, t: float, x: Array, value: Array) -> int:
         try:
             value[:] = self._value(self._start + t, x, self._u + self._slope * t)[:, 0]
+        except Exception as error:
+            self._failure = error
+            return -1
+        return 0
+
+    def _root(self, t: float, x: Array, value: Array) -> int:
+        try:
+            level = -1.0 if self._level is None else self._level(self._start + t, x)
+            value[0] = min(max(level, -CLIP), CLIP)
         except Exception as error:
             self._failure = error
             return -1

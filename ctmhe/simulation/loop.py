@@ -33,18 +33,23 @@ def simulate(
     disturbance: Drive = None,
     inputs: Inputs = None,
     monitor: float | None = None,
+    locate: float | None = 1e-9,
     start: float = 0.0,
     seed: int | np.random.Generator = 0,
     progress: bool = False,
 ) -> Run:
     """Run a plant, sample it when the trigger says so, and estimate its state after every sample.
 
-    At every event t_i the channel delivers its measurements and the estimator solves the problem of the window that
-    ends at t_i. Between events the *online* estimate is the open-loop prediction from the last solve; the
-    *retrospective* one is the estimated trajectory (thesis 3.16), which on (t_(i-1), t_i] uses what was known at t_i.
-    Guards are located between monitoring times to 1e-9 s or better by re-advancing the plant; a guard that crosses zero
-    and back between two monitoring times is not seen. Disturbance and noise depend on `seed` and the signals' names
-    only, never on the policy, so that policies can be compared under the same noise.
+    At every event t_i the channel sends its measurements, and when they arrive (at once, unless the channel is a
+    `Network`) the estimator solves the problem of the window that ends there. Between solves the *online* estimate is
+    the open-loop prediction from the last one; the *retrospective* one is the estimated trajectory (thesis 3.16), which
+    on (t_(i-1), t_i] uses what was known at t_i. Disturbance and noise depend on `seed` and the signals' names only,
+    never on the policy, so that policies can be compared under the same noise.
+
+    Guards are located between monitoring times: on a model as plant by CVODE, which looks for roots in each of its
+    steps, so that the time of an event is as exact as the solution (`OdePlant(rtol=)`); on other plants (FMUs, or
+    without scikits.odes) by going back and advancing anew until the event is known to `locate` seconds, where a guard
+    that crosses zero and back between two breaks (monitoring times, jumps of signals) is not seen.
 
     Parameters
     ----------
@@ -73,6 +78,9 @@ def simulate(
     monitor : float, optional
         Monitoring step in seconds: multiples of it are the times at which policies are asked and results are kept.
         0.01 when left out, the step of a discrete-time plant or model, whose guards are asked at monitoring times only.
+    locate : float, optional
+        Seconds to which guards are located where that is done by going back; None asks them at monitoring times only.
+        `run.dataset.attrs["location"]` says what was done.
     start : float
         Start of the run, seconds.
     seed : int or Generator
@@ -89,9 +97,12 @@ def simulate(
         For signals that do not match, a declared wait that is not shorter than the horizon (thesis 3.19), a channel
         that does not fit the estimator's `hold`, a time step that a discrete-time plant cannot make.
     TriggerError
-        When the policy raises, returns what is not an answer, or fires without end.
+        When the policy raises, returns what is not an answer, or fires without end. As on every error in mid-run,
+        `error.run` is the `Run` up to there.
     SolverError
         When the plant cannot be integrated.
+    FmuUnsupportedError
+        When guards are to be located on an FMU that cannot go back.
     """
     plant = as_plant(plant)
     start, until = finite_time(start, "simulate: start"), finite_time(until, "simulate: until")
@@ -103,6 +114,8 @@ def simulate(
     monitor = finite_time(monitor, "simulate: monitor")
     if monitor <= 0:
         raise InputError(f"simulate: monitor must be a positive number of seconds, got {monitor:g}")
+    if locate is not None and finite_time(locate, "simulate: locate") <= 0:
+        raise InputError(f"simulate: locate must be a positive number of seconds, or None, got {locate:g}")
     number = seed_of(seed)
     if inputs is None:
         inputs = getattr(plant, "u_start", getattr(getattr(plant, "model", None), "u_start", None))
@@ -116,7 +129,7 @@ def simulate(
         times=monitoring_times(start, until, monitor),
         monitor=monitor,
         seed=number,
-        locate=step is None,
+        locate=locate if step is None else None,
     )
     return loop.run(truth=truth, p_true=p_true, guess=guess, p=p, progress=progress)
 

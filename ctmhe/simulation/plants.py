@@ -11,7 +11,7 @@ import numpy as np
 from ctmhe.errors import InputError
 from ctmhe.models.continuous import Model
 from ctmhe.models.signals import Signals
-from ctmhe.simulation.integration import Integration, integration_of
+from ctmhe.simulation.integration import Integration, Level, ScikitsCvode, integration_of
 from ctmhe.types import Array
 
 WHOLE = 1e-6
@@ -111,8 +111,21 @@ class OdePlant:
         self._p = self.model.p_start if p is None else self.model.p.vector(p, "plant parameters")
         self._now, self._line = _Moment(float(t), start_state(self.model, x)), None
 
+    @property
+    def finds_roots(self) -> bool:
+        """Whether `advance_until` is there: CVODE stops at roots."""
+        return isinstance(self._integration, ScikitsCvode)
+
     def advance(self, t: float, u0: Array, u1: Array, w: Array) -> None:
         """Integrate to `t`."""
+        self._advance(t, u0, u1, w, None)
+
+    def advance_until(self, t: float, u0: Array, u1: Array, w: Array, level: Level) -> float:
+        """Integrate to the first time up to `t` at which level(time, x) reaches zero from below; return that time."""
+        self._advance(t, u0, u1, w, level)
+        return started(self).t
+
+    def _advance(self, t: float, u0: Array, u1: Array, w: Array, level: Level | None) -> None:
         now = started(self)
         if t <= now.t:
             if t == now.t:
@@ -123,7 +136,11 @@ class OdePlant:
             self._integration.restart(now.t, now.x, u0, slope, w, self._p)
             self._line = (now.t, np.array(u0), slope, np.array(w))
         try:
-            self._now = _Moment(t, self._integration.to(t))
+            if level is not None and isinstance(self._integration, ScikitsCvode):
+                t, x = self._integration.until(t, level)
+            else:
+                x = self._integration.to(t)
+            self._now = _Moment(t, x)
         except Exception:
             self._line = None
             raise
@@ -135,7 +152,11 @@ class OdePlant:
     def output(self, u: Array, w: Array) -> Array:
         """Return h(t, x, u, w, p) now."""
         now = started(self)
-        return output_of(self.model, now.t, now.x, u, w, self._p)
+        return self.output_at(now.t, now.x, u, w)
+
+    def output_at(self, t: float, x: Array, u: Array, w: Array) -> Array:
+        """Return h(t, x, u, w, p) for another time and state."""
+        return output_of(self.model, t, x, u, w, self._p)
 
     def checkpoint(self) -> object:
         """Return time and state."""

@@ -22,11 +22,13 @@ MESSAGES = {
     "y": "measured output, noise included",
     "u": "known input from the time on",
     "w": "disturbance from the time on",
+    "level": "level of the trigger, which samples when it reaches zero; inf for a certain yes, -inf for a certain no",
     "sample_time": "sampling instants t_i",
     "gap": "time since the previous sample, or since the start",
     "y_sampled": "outputs at the sampling instants",
-    "x_hat": "state estimates at the sampling instants",
-    "p_hat": "parameter estimates at the sampling instants",
+    "solve_time": "instants of the estimates: of sampling, or of the message's arrival",
+    "x_hat": "state estimates at their instants",
+    "p_hat": "parameter estimates at their instants",
     "p_true": "true parameters",
     "solve_seconds": "wall-clock time of the solve",
     "cost": "value of the cost at the solution",
@@ -34,7 +36,7 @@ MESSAGES = {
     "success": "optimality conditions hold to tolerance",
     "outcome": "how the estimate came about",
     "status": "what the solvers report",
-    "delivered": "measurements delivered at the sample",
+    "delivered": "measurements that the estimate was the first to know",
 }
 
 
@@ -52,24 +54,30 @@ class Recorder:
             "y": np.full((n, len(model.y)), np.nan),
             "u": np.full((n, len(plant.u)), np.nan),
             "w": np.full((n, len(plant.w)), np.nan),
+            "level": np.full(n, np.nan),
         }
+        self.rows = 0
         self.events: list[dict[str, Any]] = []
+        self.solves: list[dict[str, Any]] = []
 
-    def monitored(self, k: int, x_true: Array, x_online: Array, y: Array, segment: Segment) -> None:
+    def monitored(self, k: int, x_true: Array, x_online: Array, y: Array, level: float, segment: Segment) -> None:
         """Keep the row of monitoring time `k`."""
         known = np.append(x_true, np.nan)  # a state that the plant does not have is unknown
         row = {"x_true": known[self.x_map], "x_online": x_online, "y": y, "u": segment.u0, "w": segment.w}
-        for name, values in row.items():
+        for name, values in (row | {"level": level}).items():
             self.grid[name][k] = values
+        self.rows = k + 1
 
-    def sampled(self, state: Any, estimate: Estimate, t: float, previous: float, y: Array, delivered: int) -> None:
-        """Keep an event, and append its piece of the estimated trajectory (3.16) on (previous, t]."""
+    def sampled(self, t: float, previous: float, y: Array) -> None:
+        """Keep a sample."""
+        self.events.append({"sample_time": t, "gap": t - previous, "y_sampled": y})
+
+    def solved(self, state: Any, estimate: Estimate, t: float, previous: float, delivered: int) -> None:
+        """Keep an estimate, and append its piece of the estimated trajectory (3.16) on (previous, t]."""
         status = estimate.status
-        self.events.append(
+        self.solves.append(
             {
-                "sample_time": t,
-                "gap": t - previous,
-                "y_sampled": y,
+                "solve_time": t,
                 "x_hat": estimate.x,
                 "p_hat": estimate.p,
                 "solve_seconds": estimate.seconds,
@@ -88,36 +96,29 @@ class Recorder:
             self.grid["x_retro"][k] = self.loop.mhe.trajectory(state, min(float(self.times[k]), t))
 
     def finish(self, p_true: Any) -> Run:
-        """Return the run."""
+        """Return the run as far as it went."""
         loop, model, plant, now = self.loop, self.loop.model, self.loop.plant, self.loop.now
-        retro, online = self.grid["x_retro"], self.grid["x_online"]
-        retro[0] = online[0]
-        self.grid["x_retro"] = np.where(np.isnan(retro), online, retro)
-        dims = {
-            "x_true": "state",
-            "x_online": "state",
-            "x_retro": "state",
-            "y": "output",
-            "u": "input",
-            "w": "disturbance",
+        grid, times = {name: values[: self.rows] for name, values in self.grid.items()}, self.times[: self.rows]
+        retro, online = grid["x_retro"], grid["x_online"]
+        retro[:1] = online[:1]
+        grid["x_retro"] = np.where(np.isnan(retro), online, retro)
+        states, outputs, parameters = ("state", len(model.x)), ("output", len(model.y)), ("parameter", len(model.p))
+        dims = {"x_true": "state", "x_online": "state", "x_retro": "state", "y": "output", "u": "input"}
+        dims |= {"w": "disturbance"}
+        variables: dict[str, Any] = {
+            name: (("time", dims[name]) if name in dims else "time", values) for name, values in grid.items()
         }
-        variables: dict[str, Any] = {name: (("time", dims[name]), values) for name, values in self.grid.items()}
-        vectors = {
-            "y_sampled": ("output", len(model.y)),
-            "x_hat": ("state", len(model.x)),
-            "p_hat": ("parameter", len(model.p)),
-        }
-        texts, integers = ("outcome", "status"), ("iterations", "delivered")
-        for name in ("sample_time", "gap", "solve_seconds", "cost", *vectors, *integers, "success", *texts):
-            column = [event[name] for event in self.events]
-            if name in vectors:
-                dim, width = vectors[name]
-                variables[name] = (("event", dim), np.array(column, dtype=float).reshape(len(column), width))
-            else:
-                kind = (
-                    object if name in texts else np.int64 if name in integers else bool if name == "success" else float
-                )
-                variables[name] = ("event", np.array(column, dtype=kind))
+        events = {"sample_time": float, "gap": float, "y_sampled": outputs}
+        solves = {"solve_time": float, "solve_seconds": float, "cost": float, "iterations": np.int64, "success": bool}
+        solves |= {"delivered": np.int64, "outcome": object, "status": object, "x_hat": states, "p_hat": parameters}
+        for along, rows, columns in (("event", self.events, events), ("solve", self.solves, solves)):
+            for name, kind in columns.items():
+                column = [row[name] for row in rows]
+                if isinstance(kind, tuple):
+                    values = np.array(column, dtype=float).reshape(len(column), kind[1])
+                    variables[name] = ((along, kind[0]), values)
+                else:
+                    variables[name] = (along, np.array(column, dtype=kind))
         truth = self._true_parameters(p_true)
         if truth is not None:
             variables["p_true"] = ("parameter", truth)
@@ -125,7 +126,11 @@ class Recorder:
 
         data = xr.Dataset(
             {name: (*value, {"long_name": MESSAGES[name]}) for name, value in variables.items()},
-            coords={"time": ("time", np.array(self.times), {"units": "s"}), "event": np.arange(len(self.events))},
+            coords={
+                "time": ("time", np.array(times), {"units": "s"}),
+                "event": np.arange(len(self.events)),
+                "solve": np.arange(len(self.solves)),
+            },
         )
         for dim, group in (
             ("state", model.x),
@@ -135,7 +140,7 @@ class Recorder:
             ("parameter", model.p),
         ):
             data = data.assign_coords(_names(dim, group))
-        for name in ("sample_time", "gap", "solve_seconds"):
+        for name in ("sample_time", "gap", "solve_time", "solve_seconds"):
             data[name].attrs["units"] = "s"
         data.attrs = {
             "format": FORMAT,
@@ -145,14 +150,27 @@ class Recorder:
             "estimator": repr(loop.mhe),
             "trigger": repr(loop.watch.policy),
             "channel": repr(loop.channel),
-            "location": "root finding" if loop.locate else "at monitoring times",
+            "location": self._location(),
             "monitor": float(loop.monitor),
             "horizon": float(loop.mhe.horizon),
             "seed": str(loop.seed),
-            "measurements": int(now.measurements),
-            "too_late": int(now.too_late),
+            "measurements": int(loop.estimator.taken),
+            "too_late": int(loop.estimator.too_late),
+            "messages": int(now.sent),
+            "messages_lost": int(now.lost),
+            "bytes_sent": int(now.bytes),
+            "sensor_solves": 0 if loop.sensor is loop.estimator else int(loop.sensor.solves),
         }
         return Run(data)
+
+    def _location(self) -> str:
+        """Return in words how the times of events were found."""
+        loop = self.loop
+        if not loop.watch.has_guard:
+            return "at their own times"
+        if loop.locate is None:
+            return f"polled every {loop.monitor:g} s" if loop.sample_time is None else "polled at the records"
+        return "roots found by CVODE" if loop.rooted else f"search with rollback to {loop.locate:g} s"
 
     def _true_parameters(self, p_true: Any) -> Array | None:
         """Return the plant's values of the model's parameters, None where the plant does not tell."""

@@ -153,7 +153,7 @@ def replay(
         times=frozen(times),
         monitor=float(np.median(np.diff(times))),
         seed=0,
-        locate=False,
+        locate=None,
         sample_time=lambda: plant.record_time,
     )
     return loop.run(truth=None, p_true=None, guess=guess, p=p, progress=progress)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
-FORMAT = "ctmhe run 1"
+FORMAT = "ctmhe run 2"
 
 
 class Run:
@@ -27,9 +27,10 @@ class Run:
     ----------
     dataset : xarray.Dataset
         On `time` (monitoring times, seconds): `x_true`, `x_online`, `x_retro` by state, `y` by output, `u` by input,
-        `w` by disturbance. On `event` (samples): `sample_time`, `gap`, `y_sampled`, `x_hat`, `p_hat`,
-        `solve_seconds`, `cost`, `iterations`, `success`, `outcome`, `status`, `delivered`. Units are in the coordinates
-        `state_unit`, ... and in attributes; how the run was made is in the dataset's attributes.
+        `w` by disturbance, `level` of the trigger. On `event` (samples): `sample_time`, `gap`, `y_sampled`. On `solve`
+        (estimates: one a sample, or a message that arrived): `solve_time`, `x_hat`, `p_hat`, `solve_seconds`, `cost`,
+        `iterations`, `success`, `outcome`, `status`, `delivered`. Units are in the coordinates `state_unit`, ... and in
+        attributes; how the run was made is in the dataset's attributes.
     """
 
     def __init__(self, dataset: xr.Dataset):
@@ -57,8 +58,28 @@ class Run:
 
     @property
     def solves(self) -> int:
-        """Number of estimation problems solved, or tried."""
-        return self.dataset.sizes["event"]
+        """Number of estimation problems solved, or tried, by the estimator."""
+        return self.dataset.sizes["solve"]
+
+    @property
+    def sensor_solves(self) -> int:
+        """Number of those of the copy at the sensor, where the channel is not faithful (see `Network`)."""
+        return int(self.dataset.attrs["sensor_solves"])
+
+    @property
+    def messages(self) -> int:
+        """Number of messages sent, lost ones included: records together as the channel sends them."""
+        return int(self.dataset.attrs["messages"])
+
+    @property
+    def messages_lost(self) -> int:
+        """Number of messages that never arrived."""
+        return int(self.dataset.attrs["messages_lost"])
+
+    @property
+    def bytes_sent(self) -> int:
+        """Payload sent: 8 bytes for the time of a record and 8 (or the channel's own) for each value in it."""
+        return int(self.dataset.attrs["bytes_sent"])
 
     @property
     def measurements(self) -> int:
@@ -72,7 +93,7 @@ class Run:
 
     @property
     def solve_seconds(self) -> Array:
-        """Wall-clock time of every solve, (samples,)."""
+        """Wall-clock time of every solve in seconds, (solves,)."""
         return self.dataset["solve_seconds"].to_numpy()
 
     @property
@@ -126,14 +147,21 @@ class Run:
         return pd.DataFrame(columns, index=pd.Index(self.t, name="time"))
 
     def events_to_pandas(self) -> pd.DataFrame:
-        """Return a table over the samples: time, gap, status, cost, iterations, seconds, outputs and estimates."""
+        """Return a table over the samples: time, gap and outputs."""
+        return self._along("event")
+
+    def solves_to_pandas(self) -> pd.DataFrame:
+        """Return a table over the solves: time, status, cost, iterations, seconds and estimates."""
+        return self._along("solve")
+
+    def _along(self, dim: str) -> pd.DataFrame:
         import pandas as pd
 
         columns: dict[str, Any] = {}
         for variable, array in self.dataset.data_vars.items():
-            if array.dims == ("event",):
+            if array.dims == (dim,):
                 columns[str(variable)] = array.to_numpy()
-            elif array.dims and array.dims[0] == "event":
+            elif array.dims and array.dims[0] == dim:
                 names = array[array.dims[1]].to_numpy()
                 columns |= {f"{variable}.{name}": array.to_numpy()[:, i] for i, name in enumerate(names)}
         return pd.DataFrame(columns)
@@ -189,11 +217,15 @@ class Run:
             f"Run of {about['plant']!r}, t = {self.t[0]:g} to {self.t[-1]:g} s ({about['integrator']})",
             f"  trigger: {about['trigger']}",
             f"  channel: {about['channel']}",
-            f"  samples: {n}" + (f", gaps {between.min():.4g} to {between.max():.4g} s" if n > 1 else ""),
+            f"  samples: {n}"
+            + (f", gaps {between.min():.4g} to {between.max():.4g} s" if n > 1 else "" if n else ": it never fired")
+            + f" ({about['location']})",
             f"  solves: {self.solves}" + "".join(f", {count} {name}" for name, count in self.outcomes.items()),
+            f"  messages: {self.messages}, {self.bytes_sent} bytes"
+            + f", {self.messages_lost} lost" * bool(self.messages_lost),
             f"  measurements: {self.measurements} delivered, {self.too_late} too late",
         ]
-        if n:
+        if self.solves:
             rows.append(f"  solve time: median {1e3 * np.median(self.solve_seconds):.3g} ms")
         if not np.isnan(self.dataset["x_true"].to_numpy()).any():
             rows.append(f"  rms error: {self.online_rms():.4g} online, {self.retrospective_rms():.4g} retrospective")

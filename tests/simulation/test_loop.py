@@ -20,7 +20,6 @@ from ctmhe.simulation import (
     WholeSignal,
     simulate,
 )
-from ctmhe.simulation.channel import Delivery
 from ctmhe.transcription.integrators import RK4
 from ctmhe.triggers import (
     Innovation,
@@ -32,7 +31,7 @@ from ctmhe.triggers import (
     Trigger,
     trigger,
 )
-from ctmhe.types import DiscountedCost, Input, Measurement
+from ctmhe.types import DiscountedCost, Input
 
 DECAY = ContinuousModel(
     lambda t, x, u, w, p: -x + w[0],
@@ -244,34 +243,6 @@ def test_the_whole_signal_is_the_output_between_records_too():
     mhe = MHE(model, horizon=1.0, interval=0.1, integrator=RK4(step=0.1), cost=cost, hold="linear")
     exact = simulate(model, mhe, trigger=Periodic(0.17), until=2.0, guess=[0.0], truth=[0.0], monitor=0.05)
     assert (exact.dataset["cost"] < 1e-12).all()
-
-
-def test_a_link_may_delay_and_late_measurements_are_counted(mhe):
-    """A channel with a delay of 0.3 delivers on time at the next solve; beyond the horizon it is too late."""
-
-    class Delayed:
-        holds = ("zero",)
-
-        def __init__(self, seconds):
-            self.seconds = seconds
-
-        def interval(self, monitor):
-            return None
-
-        def open(self, seed):
-            return self
-
-        def record(self, t, y):
-            return []
-
-        def sample(self, t, y):
-            return [Delivery(t + self.seconds, Measurement(t, y))]
-
-    late = run(mhe, Periodic(0.2), channel=Delayed(0.3), until=2.0)
-    assert (late.too_late, late.dataset["delivered"].to_numpy()[0]) == (0, 0)
-    assert late.measurements == 9  # sent at 0 ... 1.6, arrived by 1.9
-    lost = run(mhe, Periodic(0.2), channel=Delayed(1.3), until=3.0)
-    assert lost.too_late > 0
 
 
 class TestRefusals:

@@ -105,11 +105,12 @@ def test_axes_carry_names_and_units(result):
 
 def test_tables_hold_the_same_values(result):
     """The pandas views are the dataset, column by column."""
-    table, events = result.to_pandas(), result.events_to_pandas()
+    table, events, solves = result.to_pandas(), result.events_to_pandas(), result.solves_to_pandas()
     np.testing.assert_array_equal(table["x_retro.speed"], result.dataset["x_retro"].sel(state="speed"))
     np.testing.assert_array_equal(events["sample_time"], result.sample_times)
-    np.testing.assert_array_equal(events["x_hat.position"], result.dataset["x_hat"].sel(state="position"))
-    assert len(events) == result.samples == sum(result.outcomes.values())
+    np.testing.assert_array_equal(solves["x_hat.position"], result.dataset["x_hat"].sel(state="position"))
+    assert len(events) == result.samples
+    assert len(solves) == result.solves == sum(result.outcomes.values())
 
 
 def test_a_run_draws_itself(result):

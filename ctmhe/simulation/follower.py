@@ -1,0 +1,110 @@
+"""An estimator that goes along with a run: what it was told, its last estimate, and what it expects from there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from ctmhe.errors import TooLate
+from ctmhe.estimators.mhe import MHE
+from ctmhe.estimators.state import State
+from ctmhe.types import Array, Estimate, Input, Measurement, Outcome, frozen
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """A state (nx,) at an instant, and how certain it is: `covariance()` is (n, n)."""
+
+    t: float
+    x: Array
+    covariance: Callable[[], Array]
+
+
+class Forecast:
+    """The open loop from one instant on, as a trigger sees it (`Outlook`); computed when asked, kept for the last time.
+
+    Covariances start at `known`, states at `since`, which is later when the forecast was carried along.
+    """
+
+    def __init__(self, mhe: MHE, told: State, since: float, x: Array, p: Array, known: Known):
+        self.mhe, self.told = mhe, told
+        self.since, self.x, self.p, self.known = since, x, p, known
+        self.kept: dict[str, tuple[float, Array]] = {}
+
+    def state(self, t: float) -> Array:
+        """Return the state predicted for `t`."""
+        if t <= self.since:
+            return self.x
+        return self._keep("state", t, lambda: self.mhe.propagate(self.told, self.since, t, self.x, self.p))
+
+    def output(self, t: float) -> Array:
+        """Return the output predicted for `t`."""
+        return self._keep("output", t, lambda: self.mhe.output(self.told, t, self.state(t), self.p))
+
+    def covariance(self, t: float) -> Array:
+        """Return the covariance predicted for `t`."""
+
+        def carried() -> Array:
+            start, known = self.known, self.known.covariance()
+            return self.mhe.propagate_covariance(self.told, start.t, t, start.x, self.p, known)
+
+        return self._keep("covariance", t, carried)
+
+    def at(self, told: State, t: float) -> Forecast:
+        """Return the same from `t` on, for an estimator in state `told`."""
+        t = max(t, self.since)
+        x, known = self.state(t), self.known
+        if self.kept.get("covariance", (None,))[0] == t:
+            covariance = self.kept["covariance"][1]
+            known = Known(t, x, lambda: covariance)
+        return Forecast(self.mhe, told, t, x, self.p, known)
+
+    def _keep(self, name: str, t: float, compute: Callable[[], Array]) -> Array:
+        if name not in self.kept or self.kept[name][0] != t:
+            self.kept[name] = (t, frozen(compute()))
+        return self.kept[name][1]
+
+
+class Follower:
+    """One estimator during one run. Its forecasts are values: they stay what they were when it learns more."""
+
+    def __init__(self, mhe: MHE, state: State):
+        self.mhe, self.state = mhe, state
+        self.estimate: Estimate | None = None
+        known = Known(state.t, state.x, lambda: mhe.prior_covariance(state.t))
+        self.forecast = Forecast(mhe, state, state.t, state.x, state.p, known)
+        self.solves, self.taken, self.too_late = 0, 0, 0
+
+    def tell(self, known: Input) -> None:
+        """Let it know an input."""
+        self.state = self.mhe.control(self.state, known)
+        self.forecast = self.forecast.at(self.state, self.forecast.since)
+
+    def observe(self, measurements: Iterable[Measurement]) -> int:
+        """Hand over measurements; return how many it took, the others came too late."""
+        taken = 0
+        for measurement in measurements:
+            try:
+                self.state = self.mhe.observe(self.state, measurement)
+                taken += 1
+            except TooLate:
+                self.too_late += 1
+        self.taken += taken
+        return taken
+
+    def solve(self, t: float) -> Estimate:
+        """Estimate at `t`."""
+        self.state, estimate = self.mhe.estimate(self.state, t)
+        x, p = self.state.x, self.state.p
+        covariance = lambda: estimate.covariance  # noqa: E731
+        if estimate.status.outcome is Outcome.PREDICTED:  # a solve that failed leaves the uncertainty as it was
+            carried = self.forecast.covariance(t)
+            covariance = lambda: carried  # noqa: E731
+        self.estimate = estimate
+        self.forecast = Forecast(self.mhe, self.state, t, x, p, Known(t, x, covariance))
+        self.solves += 1
+        return estimate
+
+    def carry(self, t: float) -> None:
+        """Go on from the prediction for `t`, so that predictions need not start at the last estimate again."""
+        self.forecast = self.forecast.at(self.state, t)
