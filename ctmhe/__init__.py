@@ -22,7 +22,7 @@ from ctmhe.simulation import (
     replay,
     simulate,
 )
-from ctmhe.studies import Study, StudyResult, latin_hypercube, sobol
+from ctmhe.studies import Study, StudyResult, explore, find_threshold, latin_hypercube, pareto_front, sobol
 from ctmhe.transcription import CVODES, RK4
 from ctmhe.triggers import (
     Innovation,
@@ -89,7 +89,10 @@ __all__ = [
     "Uniform",
     "WholeSignal",
     "check_fmu",
+    "explore",
+    "find_threshold",
     "latin_hypercube",
+    "pareto_front",
     "replay",
     "simulate",
     "sobol",

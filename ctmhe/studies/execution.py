@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import logging
 import pickle
+import re
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from dataclasses import dataclass
 from hashlib import sha256
@@ -48,6 +49,9 @@ class Outcome:
     values: dict[str, Value]
     error: str
     seconds: float
+
+
+Outcomes = Generator[tuple[Task, Outcome], None, None]
 
 
 @dataclass(frozen=True)
@@ -101,8 +105,8 @@ def execute(
     *,
     workers: int = 1,
     executor: Any = None,
-) -> Iterator[tuple[Task, Outcome]]:
-    """Do runs and yield their outcomes as they come.
+) -> Outcomes:
+    """Return a generator that does runs and yields their outcomes as they come.
 
     A run whose process dies is tried once more, alone, when the others are done; if it dies again, that is its error.
 
@@ -112,12 +116,15 @@ def execute(
         1: in this process; more: that many processes of our own (joblib's loky), one BLAS thread each.
     executor : concurrent.futures.Executor or dask.distributed.Client, optional
         In place of our own processes.
+
+    Raises
+    ------
+    InputError
+        At once, when the case or a value cannot be sent to another process.
     """
-    if executor is None and workers == 1:
+    if not tasks or (executor is None and workers == 1):
         points = list(design)
-        for task in tasks:
-            yield task, perform(case, points[task.point], task)
-        return
+        return ((task, perform(case, points[task.point], task)) for task in tasks)
     book = Book.of(case, design)
     if executor is None:
         pool: _Pool = _Processes(min(workers, len(tasks)))
@@ -125,15 +132,18 @@ def execute(
         pool = _Dask(executor)
     else:
         pool = _Given(executor, workers)
+    return _watched(pool, _spread(design.parameters, book, tasks, pool))
+
+
+def _watched(pool: _Pool, outcomes: Outcomes) -> Outcomes:
     try:
-        yield from _spread(design.parameters, book, tasks, pool)
-    finally:
-        pool.close()
+        yield from outcomes
+    except BaseException:  # an interrupt is the usual one
+        pool.abort()
+        raise
 
 
-def _spread(
-    parameters: tuple[str, ...], book: Book, tasks: Sequence[Task], pool: _Pool
-) -> Iterator[tuple[Task, Outcome]]:
+def _spread(parameters: tuple[str, ...], book: Book, tasks: Sequence[Task], pool: _Pool) -> Outcomes:
     queue, suspects = deque(tasks), deque[Task]()
     running: dict[Future[Any], Task] = {}
     broken = False
@@ -163,9 +173,10 @@ def _spread(
                     broken = broken or isinstance(error, BrokenExecutor)
                     if suspects and task is suspects[0]:
                         suspects.popleft()
-                        yield task, Outcome({}, f"the worker process died: {_first_line(error)}", float("nan"))
+                        yield task, Outcome({}, _death(error), float("nan"))
                     else:
-                        log.warning("a worker process died; its runs are tried again, one at a time")
+                        if not suspects:
+                            log.warning("a worker process died; what it may have been doing is tried again, run by run")
                         suspects.append(task)
                     continue
                 if outcome is None:  # the worker does not know the book yet
@@ -222,31 +233,26 @@ class _Pool:
 
     def renew(self) -> None:
         """Replace what a dying process has broken."""
-        raise NotImplementedError
 
-    def close(self) -> None:
+    def abort(self) -> None:
         """Stop what is still running."""
 
 
 class _Processes(_Pool):
-    """Processes of our own."""
+    """Processes of our own. They stay for the next study, and leave when they are idle for a minute."""
 
     def __init__(self, workers: int):
         self.workers, self.width = workers, 2 * workers
-        self.executor = self._open()
-
-    def _open(self) -> Executor:
-        try:
-            from joblib.externals.loky import ProcessPoolExecutor
-        except ImportError:
-            raise MissingExtra("joblib", "study", "running a study on several workers") from None
-        return ProcessPoolExecutor(max_workers=self.workers, timeout=300, env=ONE_THREAD)  # pyright: ignore
+        self.renew()
 
     def renew(self) -> None:
-        self.close()
-        self.executor = self._open()
+        try:
+            from joblib.externals.loky import get_reusable_executor
+        except ImportError:
+            raise MissingExtra("joblib", "study", "running a study on several workers") from None
+        self.executor = get_reusable_executor(max_workers=self.workers, timeout=60, env=ONE_THREAD)
 
-    def close(self) -> None:
+    def abort(self) -> None:
         self.executor.shutdown(wait=True, kill_workers=True)  # pyright: ignore
 
 
@@ -266,9 +272,9 @@ class _Given(_Pool):
             self.own.renew()
         self.executor = self.own.executor
 
-    def close(self) -> None:
+    def abort(self) -> None:
         if self.own is not None:
-            self.own.close()
+            self.own.abort()
 
 
 class _Dask(_Pool):
@@ -284,12 +290,8 @@ class _Dask(_Pool):
             self.known = self.client.submit(bytes, book.content, key=f"ctmhe-study-{book.digest}")
         return self.known
 
-    def renew(self) -> None:
-        self.executor = self.client.get_executor(pure=False)
-
-    def close(self) -> None:
+    def abort(self) -> None:
         self.executor.shutdown(wait=False)
-        self.known = None
 
 
 def _died(error: Exception) -> bool:
@@ -297,8 +299,13 @@ def _died(error: Exception) -> bool:
     return isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"
 
 
-def _first_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:300] or type(error).__name__
+def _death(error: Exception) -> str:
+    """Return what is said of a run whose process died again."""
+    signal = re.search(r"[A-Z]+\(-\d+\)", str(error))
+    how = f" ({signal[0]})" if signal else ""
+    return (
+        f"{type(error).__name__}: the process of this run died{how}, twice: a crash in compiled code, or out of memory"
+    )
 
 
 def _culprit(case: Callable[..., Any], design: Design, dumps: Callable[[Any], bytes]) -> InputError | None:

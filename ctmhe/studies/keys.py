@@ -39,7 +39,7 @@ def digest(*parts: Any) -> str:
 
 def describe(value: Any) -> str:
     """Return the description of a value or function."""
-    return _Description(getattr(value, "__module__", None)).of(value)
+    return _Description(getattr(getattr(value, "func", value), "__module__", None)).of(value)
 
 
 class _Description:

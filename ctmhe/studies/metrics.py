@@ -69,7 +69,7 @@ def plain(name: str, value: Any) -> Value:
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, (bool, int, float, str)):
-        return value
+        return float(value) if isinstance(value, int) and abs(value) >= 2**63 else value
     raise InputError(f"metric {name!r}: expected a number, a boolean or text, got {value!r}")
 
 

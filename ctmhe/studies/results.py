@@ -76,6 +76,18 @@ class StudyResult:
 
         return pd.DataFrame(rows)
 
+    def means(self, *metrics: str) -> pd.DataFrame:
+        """Return the means of several metrics, one row a point; NaN where all of its runs failed.
+
+        Columns: the parameters, then `metrics`. What `pareto_front` takes.
+        """
+        for metric in metrics:
+            self._check_metric(metric)
+        import pandas as pd
+
+        groups = _groups(self.table, self.parameters)
+        return pd.DataFrame([{**labels, **{m: group[m].mean() for m in metrics}} for labels, group in groups])
+
     def compare(
         self,
         metric: str,
@@ -197,7 +209,12 @@ def make_table(
             _check(metric, found, "metric")
     wanted = tuple(found if metrics is None else metrics)
     columns = [*parameters, "seed", *wanted, "error", "seconds", "key"]
-    return StudyResult(pd.DataFrame(list(rows), columns=columns), parameters, wanted, name, store)
+    table = pd.DataFrame(list(rows), columns=columns)
+    for metric in wanted:
+        kinds = {isinstance(value, str) for value in table[metric].dropna()}
+        if len(kinds) > 1:  # a column is numbers or text
+            table[metric] = table[metric].map(str, na_action="ignore")
+    return StudyResult(table, parameters, wanted, name, store)
 
 
 def interval(values: Array, confidence: float) -> tuple[float, float, float, float]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import logging
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -144,6 +144,10 @@ class Store:
                 rows[key] = row
         return rows
 
+    def stale(self, keys: Container[str]) -> int:
+        """Return the number of finished runs that are none of these."""
+        return sum(path.stem not in keys for path in (self.folder / "runs").glob("*.parquet"))
+
     def write_table(self, table: pd.DataFrame) -> None:
         """Write the table of all runs."""
         pa, parquet = _arrow()
@@ -163,7 +167,7 @@ def status(folder: str | Path) -> Status:
     about = store.read_about()
     if about is None:
         raise InputError(f"study: there is no study in {str(folder)!r} (no study.json)")
-    return status_of(store, about["keys"], bool(about["trajectories"]))
+    return status_of(store, list(about["keys"]), bool(about["trajectories"]))
 
 
 def status_of(store: Store, keys: Sequence[str], trajectories: bool) -> Status:
@@ -174,7 +178,7 @@ def status_of(store: Store, keys: Sequence[str], trajectories: bool) -> Status:
     span = last[-1] - last[0] if len(last) > 1 else 0.0
     failed = sum(bool(row["error"]) for row in rows.values())
     rate = (len(last) - 1) / span if span > 0 else np.nan
-    return Status(len(keys), len(rows), failed, len(keys) - len(rows), len(set(ages) - set(keys)), rate)
+    return Status(len(keys), len(rows), failed, len(keys) - len(rows), store.stale(keys), rate)
 
 
 def finished(store: Store, keys: Sequence[str], trajectories: bool) -> dict[str, Row]:

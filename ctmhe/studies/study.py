@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ctmhe.errors import InputError, MissingExtra
+from ctmhe.errors import InputError
 from ctmhe.studies.design import RESERVED, Design, as_design, named
-from ctmhe.studies.execution import Book, Outcome, Task, execute
-from ctmhe.studies.keys import digest
+from ctmhe.studies.execution import Outcome, Task, execute
+from ctmhe.studies.keys import describe, digest
 from ctmhe.studies.results import StudyResult, make_table
 from ctmhe.studies.store import Row, Status, Store, finished, status_of
 
@@ -122,20 +122,19 @@ class Study:
         """
         if isinstance(workers, bool) or not isinstance(workers, (int, np.integer)) or workers < 1:
             raise InputError(f"study: workers must be a whole number of at least 1, got {workers!r}")
-        if executor is not None or workers > 1:
-            Book.of(self.case, self.design)
         rows: dict[str, Row] = {}
         if self.store is not None:
-            self.store.write_about(self._about())
             rows = finished(self.store, list(self._keys), self.trajectories)
-            stale = status_of(self.store, list(self._keys), False).stale
+            stale = self.store.stale(self._keys)
             if stale and not rows:
                 log.warning("study %r: the case has changed; %d kept runs are stale and not used", self.name, stale)
             if retry_failed:
                 rows = {key: row for key, row in rows.items() if not row["error"]}
         tasks = [task for task in self._tasks() if task.key not in rows]
-        bar = _bar(progress, len(self._keys), len(rows), self.name)
         outcomes = execute(self.case, self.design, tasks, workers=int(workers), executor=executor)
+        if self.store is not None:
+            self.store.write_about(self._about())
+        bar = _bar(progress, len(self._keys), len(rows), self.name)
         try:
             for task, outcome in outcomes:
                 row = self._row(task, outcome)
@@ -144,9 +143,12 @@ class Study:
                 rows[task.key] = row
                 bar.update()
         finally:
-            outcomes.close()  # type: ignore[attr-defined]
+            outcomes.close()
             bar.close()
-        return self._result(rows)
+        result = self._result(rows)
+        if self.store is not None:
+            self.store.write_table(result.table)
+        return result
 
     def result(self) -> StudyResult:
         """Return the runs that are finished, without doing any."""
@@ -187,7 +189,7 @@ class Study:
         keys: dict[str, Task] = {}
         rows = zip(self.design.labels, self.design.values, strict=True)
         for point, (labels, values) in enumerate(rows):
-            here = digest(common, dict(zip(self.design.parameters, labels, strict=True)), *map(_described, values))
+            here = digest(common, dict(zip(self.design.parameters, labels, strict=True)), *map(describe, values))
             for seed in self.seeds:
                 key = digest(here, str(seed))
                 kept = None
@@ -211,10 +213,7 @@ class Study:
 
     def _result(self, rows: Mapping[str, Row]) -> StudyResult:
         ordered = [rows[key] for key in self._keys if key in rows]
-        result = make_table(ordered, self.design.parameters, self.metrics, self.name, self.store)
-        if self.store is not None:
-            self.store.write_table(result.table)
-        return result
+        return make_table(ordered, self.design.parameters, self.metrics, self.name, self.store)
 
     def _about(self) -> dict[str, Any]:
         from ctmhe import __version__
@@ -259,12 +258,6 @@ class Study:
         if self.store is None:
             raise InputError(f"study: {what}() reads the folder of a study; this one has none (folder=)")
         return self.store
-
-
-def _described(value: Any) -> str:
-    from ctmhe.studies.keys import describe
-
-    return describe(value)
 
 
 def _case_name(case: Callable[..., Any]) -> str:
@@ -316,8 +309,6 @@ class _Quiet:
 def _bar(progress: bool, total: int, done: int, name: str) -> Any:
     if not progress:
         return _Quiet()
-    try:
-        from tqdm.auto import tqdm
-    except ImportError:
-        raise MissingExtra("tqdm", "study", "a progress bar") from None
+    from tqdm import tqdm
+
     return tqdm(total=total, initial=done, desc=name, unit="run")
