@@ -131,7 +131,7 @@ class StudyResult:
             mean, _, low, high = interval(gap, confidence)
             better = gap > 0 if higher_is_better else gap < 0
             about = {"n": int(both.sum()), "dropped": int((~both).sum()), "difference": mean, "low": low, "high": high}
-            divisor = other[both].mean() if both.any() else np.nan
+            divisor = other[both].mean() if both.any() else 0.0
             about["ratio"] = mine[both].mean() / divisor if divisor else np.nan
             rows.append({**labels, **about, "better": better.mean() if both.any() else np.nan})
         import pandas as pd
