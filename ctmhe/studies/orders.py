@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from ctmhe.errors import InputError
@@ -20,6 +20,8 @@ class Order:
 
     Attributes
     ----------
+    name : str
+        Of the study.
     directory : str
         Folder of the TOML file, where paths in it start.
     case : str or None
@@ -30,6 +32,7 @@ class Order:
         In place of the file's.
     """
 
+    name: str
     directory: str
     case: str | None = None
     seeds: int | None = None
@@ -63,7 +66,7 @@ def begin(
     if case is not None:
         file, _, function = case.rpartition(":")
         case = f"{Path(file).absolute()}:{function}"
-    order = Order(str(Path(path).parent.absolute()), case, seeds, workers)
+    order = Order(description.name, str(Path(path).parent.absolute()), case, seeds, workers)
     folder.mkdir(parents=True, exist_ok=True)
     with replacing(folder / FILE) as temporary:
         temporary.write_bytes(Path(path).read_bytes())
@@ -92,4 +95,5 @@ def reopen(folder: Path) -> tuple[Study, int]:
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"study: {folder / ORDER} cannot be read: {error}") from None
     description = load_study(folder / FILE, case=order.case, directory=Path(order.directory))
-    return description.study(folder, seeds=order.seeds), order.workers or description.workers
+    study = replace(description, name=order.name).study(folder, seeds=order.seeds)
+    return study, order.workers or description.workers
