@@ -29,7 +29,7 @@ from ctmhe.solvers.ladder import climb
 from ctmhe.solvers.updates import CompiledUpdates
 from ctmhe.solvers.verification import verify as check
 from ctmhe.transcription.assembly import Assembly, Records, hold_kinds
-from ctmhe.transcription.grid import Mesh, same_time
+from ctmhe.transcription.grid import Mesh, plain_mesh, same_time
 from ctmhe.transcription.integrators import Integrator, StepMap
 from ctmhe.transcription.problem import Window
 from ctmhe.transcription.solved import Layout, Solved
@@ -50,6 +50,8 @@ from ctmhe.types import (
 )
 
 logger = logging.getLogger(__name__)
+
+NOTHING = np.empty(0)
 
 SOLVERS = ("gauss-newton", "numpy", "ipopt")
 
@@ -230,7 +232,7 @@ class MHE:
             self._updates = CompiledUpdates(compiled, self.assembly, self._layout, real_time=self._real_time)
         self._check = Ipopt(self.stage, options={"ipopt.mu_init": 1e-8}) if verify else None
         self._holds = bool(self.assembly.held.any())
-        self._silent = np.zeros(len(model.w))
+        self._silent, self._unmeasured = np.zeros(len(model.w)), np.empty((0, len(model.y)))
         self._widths = (self.stage.nx + self.stage.np, self.stage.ny)  # of a state of this estimator
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -564,9 +566,7 @@ class MHE:
         """
         if t1 <= t0:
             return x
-        records = Records(np.empty(0), np.empty((0, len(self.model.y))), *self._known_inputs(state, t0, t1))
-        mesh = self._prediction_mesh(t0, t1, records)
-        u0, u1 = self._inputs_on(mesh, records)
+        mesh, u0, u1 = self._open_loop(state, t0, t1)
         try:
             for k in range(len(mesh)):
                 x, _ = self.stage.step(mesh.t[k], mesh.h[k], x, self._silent, p, u0[k], u1[k])
@@ -582,7 +582,8 @@ class MHE:
         """Return the covariance (n, n) of (x, estimated p) at `t1` along the open loop from `x`, `p` at `t0`.
 
         What `Estimate.covariance` would be at `t1` if nothing were measured from `t0` on: disturbances of weight Q
-        spread it, the discount widens it. Infinite variances stay infinite in all signals that they reach.
+        spread it, the discount widens it. Infinite variances stay infinite in all signals that they reach. Where the
+        model cannot be evaluated, all variances are infinite.
 
         Parameters
         ----------
@@ -597,19 +598,24 @@ class MHE:
         """
         if t1 <= t0:
             return covariance
-        records = Records(np.empty(0), np.empty((0, len(self.model.y))), *self._known_inputs(state, t0, t1))
-        mesh = self._prediction_mesh(t0, t1, records)
-        drive = self._inputs_on(mesh, records)
-        return frozen(carried_covariance(self.stage, self.assembly, mesh, *drive, x, p, covariance))
+        drive = self._open_loop(state, t0, t1)
+        try:
+            return frozen(carried_covariance(self.stage, self.assembly, *drive, x, p, covariance))
+        except FloatingPointError:
+            logger.warning("the covariance from t = %g s to %g s is infinite: the model fails", t0, t1)
+            return frozen(np.diag(np.full(len(covariance), np.inf)))
 
-    def _prediction_mesh(self, t0: float, t1: float, records: Records) -> Mesh:
-        return self.assembly.mesh(t0, t1, records, growing=False)
-
-    def _inputs_on(self, mesh: Mesh, records: Records) -> tuple[Array, Array]:
-
+    def _open_loop(self, state: State, t0: float, t1: float) -> tuple[Mesh, Array, Array]:
+        """Return the mesh of a prediction and the inputs at both ends of its slots."""
+        times, rows = self._known_inputs(state, t0, t1)
+        if not self.assembly.discrete and not (len(times) and times[-1] > t0):
+            mesh = plain_mesh(t0, t1, self.interval)  # no switch on the way: most predictions
+        else:
+            mesh = self.assembly.mesh(t0, t1, Records(NOTHING, self._unmeasured, times, rows), growing=False)
         if not len(self.model.u):
-            return np.empty((len(mesh), 0)), np.empty((len(mesh), 0))
-        return held_inputs(records.u_times, records.u, mesh.t, mesh.tolerance, self.assembly.input_linear)
+            none = np.empty((len(mesh), 0))
+            return mesh, none, none
+        return mesh, *held_inputs(times, rows, mesh.t, mesh.tolerance, self.assembly.input_linear)
 
     def output(self, state: State, t: float, x: Array, p: Array) -> Array:
         """Return the undisturbed output (ny,) at `t` for a given state and parameters, under the known input.
@@ -625,8 +631,8 @@ class MHE:
 
     def _output(self, t: float, x: Array, u: Array, w: Array, p: Array) -> Array:
         try:
-            return np.asarray(self.model.output(t, x, u, w, p)).reshape(-1)
-        except RuntimeError:  # an FMU that fails there
+            return self.stage.output(t, x, u, w, p)
+        except FloatingPointError:  # an FMU that fails there
             return np.full(len(self.model.y), np.nan)
 
     def predict(self, state: State, t: float) -> Prediction:

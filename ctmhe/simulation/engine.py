@@ -31,7 +31,11 @@ MOST_SAMPLES = 1000
 """Samples within one monitoring step beyond which a policy is taken to run away."""
 
 MOST_SHORT_GAPS = 10
-"""Consecutive samples at the smallest gap beyond which a policy is taken to run away."""
+"""Consecutive samples without time passing beyond which a policy is taken to run away."""
+
+SHORT = 0.01
+"""Share of the monitoring step below which the gap after a sample is short: the third such gap in a row is the last
+before the next monitoring time, as far as guards are concerned."""
 
 
 @dataclass
@@ -51,6 +55,8 @@ class Progress:
     bytes: int = 0
     in_step: int = 0
     short_gaps: int = 0
+    standing: int = 0
+    hushed: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,6 +296,8 @@ class Loop:
         message = self.link.sample(now.t if self.sample_time is None else self.sample_time(), y)
         self.recorder.sampled(now.t, now.last_event, y)
         now.y_last = frozen(np.where(np.isnan(y), now.y_last, y))
+        soon = now.samples > 0 and now.t - now.last_event <= SHORT * self.monitor
+        now.standing = now.standing + 1 if soon else 0
         now.last_event, now.samples = now.t, now.samples + 1
         if message:
             self._post(message, now.messages)
@@ -299,6 +307,19 @@ class Loop:
         if self.sensor is not self.estimator:
             self.sensor.solve(now.t)
         now.watch = self.watch.sampled(now.watch, ctx, self._context(now.t, y))
+        if now.standing >= 3:
+            self._hush()
+
+    def _hush(self) -> None:
+        """Silence guards until the next monitoring time: a sample does not lower them, they come back at once."""
+        now = self.now
+        now.watch, now.standing, now.hushed = self.watch.silenced(now.watch), 0, now.hushed + 1
+        if now.hushed == 1:
+            logger.warning(
+                "policy %r: its guard reaches zero again right after its samples, at t = %.9g s; then it is asked at "
+                "monitoring times only. A dead time of your own says better what is meant: policy & MinInterval(%g)",
+                self.watch.policy, now.t, self.monitor,
+            )  # fmt: skip
 
     def _post(self, message: list[Delivery], queue: list[Any]) -> None:
         """Put a message on the way, and let the copy at the sensor know what it says."""

@@ -72,9 +72,9 @@ class ScikitsCvode:
         except ImportError as error:
             raise MissingExtra("scikits.odes", "sundials", "OdePlant(backend='scikits.odes')") from error
         self._messages: list[str] = []
-        self._value = _Buffered(model.dynamics, (len(model.x), 1))
+        self._value = Buffered(model.dynamics, (len(model.x), 1))
         jacobian = ca.Function("dfdx", *_jacobian(model))
-        self._jacobian = _Buffered(jacobian, (len(model.x), len(model.x)))
+        self._jacobian = Buffered(jacobian, (len(model.x), len(model.x)))
         self._u = self._slope = np.zeros(len(model.u))
         self._start = 0.0
         self._clock = 0.0
@@ -224,8 +224,8 @@ class CasadiCvodes:
         return self._x
 
 
-class _Buffered:
-    """A CasADi function of (t, x, u, w, p) on memory of its own, so that a call allocates nothing."""
+class Buffered:
+    """A CasADi function of (t, x, u, w, p) on memory of its own: w and p stay, a call writes over the last result."""
 
     def __init__(self, function: ca.Function, shape: tuple[int, int]):
         sizes = [function.numel_in(i) for i in range(5)]
@@ -241,6 +241,7 @@ class _Buffered:
         buffer.set_res(0, memoryview(self._result.reshape(-1, order="F")))  # type: ignore[arg-type]
 
     def __call__(self, t: float, x: Array, u: Array) -> Array:
+        """Return the value, valid until the next call."""
         self._arguments[0][0] = t
         self._x[:], self._u[:] = x, u
         self._evaluate()

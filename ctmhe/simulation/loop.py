@@ -49,7 +49,9 @@ def simulate(
     Guards are located between monitoring times: on a model as plant by CVODE, which looks for roots in each of its
     steps, so that the time of an event is as exact as the solution (`OdePlant(rtol=)`); on other plants (FMUs, or
     without scikits.odes) by going back and advancing anew until the event is known to `locate` seconds, where a guard
-    that crosses zero and back between two breaks (monitoring times, jumps of signals) is not seen.
+    that crosses zero and back between two breaks (monitoring times, jumps of signals) is not seen. A guard that is
+    back at zero within a hundredth of the monitoring step, three samples in a row, is silent until the next
+    monitoring time (`Run.hushed`).
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ import numpy as np
 from ctmhe.errors import InputError
 from ctmhe.models.continuous import Model
 from ctmhe.models.signals import Signals
-from ctmhe.simulation.integration import Integration, Level, ScikitsCvode, integration_of
+from ctmhe.simulation.integration import Buffered, Integration, Level, ScikitsCvode, integration_of
 from ctmhe.types import Array
 
 WHOLE = 1e-6
@@ -102,6 +102,7 @@ class OdePlant:
         self._integration: Integration = integration_of(model, rtol, atol, backend)
         self.integrator = f"{self._integration.name}, rtol {rtol:g}, atol {atol:g}"
         self._driving = driving_disturbances(model)
+        self._output = Buffered(model.output, (len(model.y), 1))
         self._p = model.p_start
         self._now: _Moment | None = None
         self._line: tuple[float, Array, Array, Array] | None = None
@@ -121,7 +122,17 @@ class OdePlant:
         self._advance(t, u0, u1, w, None)
 
     def advance_until(self, t: float, u0: Array, u1: Array, w: Array, level: Level) -> float:
-        """Integrate to the first time up to `t` at which level(time, x) reaches zero from below; return that time."""
+        """Integrate to the first time up to `t` at which level(time, x) reaches zero from below; return that time.
+
+        CVODE asks for the level in each of its steps. Where a signal has jumped it begins with many tiny ones: then the
+        level at `t` is looked at first, and the way is gone again only where that has been reached.
+        """
+        now = started(self)
+        if t > now.t and not self._on_line(now.t, u0, (u1 - u0) / (t - now.t), w):
+            self._advance(t, u0, u1, w, None)
+            if level(t, self.state()) < 0:
+                return t
+            self._now, self._line = now, None
         self._advance(t, u0, u1, w, level)
         return started(self).t
 
@@ -156,7 +167,8 @@ class OdePlant:
 
     def output_at(self, t: float, x: Array, u: Array, w: Array) -> Array:
         """Return h(t, x, u, w, p) for another time and state."""
-        return output_of(self.model, t, x, u, w, self._p)
+        self._output.w[:], self._output.p[:] = w, self._p
+        return self._output(t, x, u)[:, 0].copy()
 
     def checkpoint(self) -> object:
         """Return time and state."""
@@ -231,7 +243,7 @@ class MapPlant:
     def output(self, u: Array, w: Array) -> Array:
         """Return h(t, x, u, w, p) now."""
         now = started(self)
-        return output_of(self.model, now.t, now.x, u, w, self._p)
+        return vector_of(self.model.output(now.t, now.x, u, w, self._p))
 
     def checkpoint(self) -> object:
         """Return time and state."""
@@ -275,11 +287,6 @@ def started(plant: OdePlant | MapPlant) -> _Moment:
     if plant._now is None:
         raise InputError(f"plant {plant.name!r} was not started; call start(t, x)")
     return plant._now
-
-
-def output_of(model: Model, t: float, x: Array, u: Array, w: Array, p: Array) -> Array:
-    """Return h(t, x, u, w, p) as a vector (ny,)."""
-    return vector_of(model.output(t, x, u, w, p))
 
 
 def vector_of(value: Any) -> Array:

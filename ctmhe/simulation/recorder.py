@@ -159,6 +159,7 @@ class Recorder:
             "messages": int(now.sent),
             "messages_lost": int(now.lost),
             "bytes_sent": int(now.bytes),
+            "hushed": int(now.hushed),
             "sensor_solves": 0 if loop.sensor is loop.estimator else int(loop.sensor.solves),
         }
         return Run(data)

@@ -82,6 +82,11 @@ class Run:
         return int(self.dataset.attrs["bytes_sent"])
 
     @property
+    def hushed(self) -> int:
+        """How often guards were silenced until the next monitoring time, since they came back right after a sample."""
+        return int(self.dataset.attrs["hushed"])
+
+    @property
     def measurements(self) -> int:
         """Number of measurements (time points) that reached the estimator."""
         return int(self.dataset.attrs["measurements"])
@@ -225,6 +230,8 @@ class Run:
             + f", {self.messages_lost} lost" * bool(self.messages_lost),
             f"  measurements: {self.measurements} delivered, {self.too_late} too late",
         ]
+        if self.hushed:
+            rows.append(f"  guards silenced {self.hushed} times: they came back right after a sample")
         if self.solves:
             rows.append(f"  solve time: median {1e3 * np.median(self.solve_seconds):.3g} ms")
         if not np.isnan(self.dataset["x_true"].to_numpy()).any():

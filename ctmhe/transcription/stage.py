@@ -138,6 +138,14 @@ class StageFunction:
             y[-1] = rows[-1]
         return x, y
 
+    def output(self, t: float, x: Array, u: Array, w: Array, p: Array) -> Array:
+        """Return h(t, x, u, w, p), (ny,)."""
+        bound = self._scratch().output
+        for array, value in zip(bound.inputs, (t, x, u, w, p), strict=True):
+            array[0] = value
+        bound.run()
+        return bound.outputs[0].reshape(-1).copy()
+
     def values(self, t: Array, h: Array, x: Array, w: Array, p: Array, u0: Array, u1: Array) -> tuple[Array, Array]:
         """Evaluate N slots: x_next (N, nx) and y (N, q, ny), without Jacobians."""
         x_next, y = np.array(x, dtype=float), np.zeros((len(t), self.q, self.ny))
@@ -216,6 +224,7 @@ class _Scratch:
     def __init__(self, stage: StageFunction):
         self.stage = stage
         self.bound = [[_bind(function, size) for size, function in group.items()] for group in stage.mapped]
+        self.output = _bind(stage.model.output, 1)
 
     def one(self, *values) -> tuple[Array, Array]:
         bound = self.bound[0][-1]

@@ -1,17 +1,15 @@
-"""What a trigger policy is, what it is shown, and how its answers are checked."""
+"""What a trigger policy is, and what it is shown."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
-from ctmhe.errors import InputError, TriggerError
+from ctmhe.errors import InputError
 from ctmhe.types import Array, Estimate
-
-QUESTIONS = ("fires", "guard", "next_time")
 
 
 class Outlook(Protocol):
@@ -137,8 +135,8 @@ class Trigger:
     when both agree; guards stay exactly located, times exact, and a yes from `fires` stands until the next monitoring
     time or sample. Inside `&`, a self-triggered policy agrees from its `next_time` on.
 
-    Policies are immutable. What one has to remember lives in `ctx.state`, which `init_state` starts and `update`
-    replaces, so that one policy can serve many runs.
+    Policies are immutable. What one has to remember lives in `ctx.state`, which `init_state` starts and `update` and
+    `after_sample` replace, so that one policy can serve many runs.
     """
 
     def guard(self, ctx: TriggerContext) -> float:
@@ -154,7 +152,10 @@ class Trigger:
         raise NotImplementedError
 
     def init_state(self) -> Any:
-        """Return the memory at the start of a run; None when there is none."""
+        """Return the memory at the start of a run; None when there is none.
+
+        Memory is made immutable: arrays read-only, dicts mappings that cannot be changed, lists tuples.
+        """
         return None
 
     def update(self, ctx: TriggerContext, fired: bool) -> Any:
@@ -162,6 +163,13 @@ class Trigger:
 
         `ctx.state` is the old memory, which must not be changed in place. `fired` tells whether a sample is taken at
         `ctx.t`, by this or another policy.
+        """
+        return ctx.state
+
+    def after_sample(self, ctx: TriggerContext) -> Any:
+        """Return the new memory. Called after `update` at every sample, with the context that knows of the sample.
+
+        For what depends on the new estimate or on the level that the sample left behind.
         """
         return ctx.state
 
@@ -228,92 +236,3 @@ def trigger(function: Callable[[TriggerContext], bool]) -> Predicate:
     drifted | MaxInterval(seconds=0.19)
     """
     return Predicate(function)
-
-
-def kind_of(policy: Trigger) -> str:
-    """Return which of `fires`, `guard` and `next_time` a policy answers."""
-    if not isinstance(policy, Trigger):
-        hint = "call the class" if isinstance(policy, type) else "decorate a function with @trigger"
-        raise TriggerError(f"{policy!r} is not a Trigger; {hint}")
-    written = [name for name in QUESTIONS if getattr(type(policy), name) is not getattr(Trigger, name)]
-    if len(written) != 1:
-        raise TriggerError(
-            f"policy {policy!r} must define exactly one of {', '.join(QUESTIONS)}; it defines "
-            f"{', '.join(written) or 'none'}. Write two policies and join them with | or &"
-        )
-    return written[0]
-
-
-def call(policy: Trigger, method: str, ctx: TriggerContext, *arguments: Any) -> Any:
-    """Call a method of a policy; whatever it raises becomes a `TriggerError` that names the policy and the time."""
-    try:
-        return getattr(policy, method)(ctx, *arguments)
-    except TriggerError:
-        raise
-    except Exception as error:
-        hint = ""
-        if "read-only" in str(error) or "cannot assign to field" in str(error):
-            hint = "; the context is read-only: copy an array before changing it, keep memory in update()"
-        raise TriggerError(
-            f"policy {policy!r}: {method} failed at t = {ctx.t:.9g}: {type(error).__name__}: {error}{hint}"
-        ) from error
-
-
-def ask_level(policy: Trigger, ctx: TriggerContext) -> float:
-    """Return the checked value of `guard`."""
-    value = call(policy, "guard", ctx)
-    if isinstance(value, np.ndarray) and value.size == 1:
-        value = value.item()
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
-        raise TriggerError(
-            f"policy {policy!r}: guard returned {value!r} at t = {ctx.t:.9g}; expected a number that reaches zero when "
-            "a sample is due (for yes or no, write fires or use @trigger)"
-        )
-    if np.isnan(value):
-        raise TriggerError(
-            f"policy {policy!r}: guard returned NaN at t = {ctx.t:.9g}. ctx.y_last is NaN before the first sample "
-            "(ctx.samples == 0) and ctx.y where a sensor has no value: return inf or -inf there"
-        )
-    return float(value)
-
-
-def ask_yes(policy: Trigger, ctx: TriggerContext) -> bool:
-    """Return the checked answer of `fires`."""
-    value = call(policy, "fires", ctx)
-    if isinstance(value, np.ndarray) and value.size == 1:
-        value = value.item()
-    if not isinstance(value, (bool, np.bool_)):
-        hint = " (is a return missing?)" if value is None else ""
-        raise TriggerError(f"policy {policy!r} returned {value!r} at t = {ctx.t:.9g}; expected True or False{hint}")
-    return bool(value)
-
-
-def ask_time(policy: Trigger, ctx: TriggerContext, earliest: float) -> float:
-    """Return the checked answer of `next_time`: not NaN and not before `earliest`."""
-    value = call(policy, "next_time", ctx)
-    if isinstance(value, np.ndarray) and value.size == 1:
-        value = value.item()
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
-        raise TriggerError(
-            f"policy {policy!r}: next_time returned {value!r} at t = {ctx.t:.9g}; expected an absolute time in "
-            "seconds, inf for never"
-        )
-    if not value >= earliest:
-        raise TriggerError(
-            f"policy {policy!r}: next_time returned {value!r} at t = {ctx.t:.9g}, which does not lie ahead; return an "
-            "absolute time after ctx.t (ctx.t + wait), inf for never"
-        )
-    return float(value)
-
-
-def initial_memory(policy: Trigger) -> Any:
-    """Return the policy's memory at the start of a run."""
-    try:
-        return policy.init_state()
-    except Exception as error:
-        raise TriggerError(f"policy {policy!r}: init_state failed: {type(error).__name__}: {error}") from error
-
-
-def remember(policy: Trigger, ctx: TriggerContext, state: Any, fired: bool) -> Any:
-    """Return the policy's memory after `update`."""
-    return call(policy, "update", replace(ctx, state=state), fired)

@@ -1,13 +1,16 @@
-"""Policies made of policies: earliest of several, all of several, dead time and longest wait."""
+"""Policies made of policies: earliest of several, all of several, dead time, longest wait, hysteresis."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from ctmhe.errors import InputError
+from ctmhe.triggers.answers import ask_level, initial_memory, kind_of, remember, settle
 from ctmhe.triggers.base import Trigger, TriggerContext
+from ctmhe.triggers.checks import positive
 
 
 class Combined(Trigger):
@@ -32,7 +35,7 @@ class Combined(Trigger):
         return cls(*sides[0], *sides[1])
 
     def __repr__(self) -> str:
-        texts = (f"({part!r})" if isinstance(part, Combined) else repr(part) for part in self.parts)
+        texts = (f"({part!r})" if type(part) in (Or, And) else repr(part) for part in self.parts)
         return f" {self.sign} ".join(texts)
 
 
@@ -114,12 +117,50 @@ class MaxInterval(Trigger):
         return self.seconds
 
 
-def positive(value: float, what: str) -> float:
-    """Return `value` as a float, or raise when it is not a positive finite number."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        raise InputError(f"{what} must be a number, got {value!r}") from None
-    if not (np.isfinite(number) and number > 0):
-        raise InputError(f"{what} must be finite and positive, got {value!r}")
-    return number
+@dataclass(frozen=True, repr=False)
+class Hysteresis(Trigger):
+    """A guard that speaks once: after a sample it is silent until its level has fallen to <= -release.
+
+    Against a level that hovers about zero. Its fall is noticed right after the sample and at monitoring times. A sample
+    of another policy silences it as well, until the level is as low.
+
+    Parameters
+    ----------
+    policy : Trigger
+        With a guard, not joined by `|` or `&`.
+    release : float
+        How far below zero the level must fall, >= 0, in the unit of the level.
+    """
+
+    policy: Trigger
+    release: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "release", positive(self.release, "Hysteresis: release", zero=True))
+        if isinstance(self.policy, Combined) or kind_of(self.policy) != "guard":
+            raise InputError(
+                f"Hysteresis: expected one policy with a guard, got {self.policy!r}; wrap the guards inside | and & "
+                "one by one"
+            )
+
+    def init_state(self) -> Any:
+        """Return the memory of the policy inside, and that it is armed."""
+        return initial_memory(self.policy), True
+
+    def guard(self, ctx: TriggerContext) -> float:
+        """Return the level of the policy inside while it is armed."""
+        return self._level(ctx) if ctx.state[1] else -np.inf
+
+    def update(self, ctx: TriggerContext, fired: bool) -> Any:
+        """Disarm at a sample; arm again when the level is low."""
+        memory, armed = ctx.state
+        armed = not fired and (armed or self._level(ctx) <= -self.release)
+        return remember(self.policy, ctx, memory, fired), armed
+
+    def after_sample(self, ctx: TriggerContext) -> Any:
+        """Arm at once when the sample has brought the level down."""
+        memory = settle(self.policy, ctx, ctx.state[0])
+        return memory, self._level(replace(ctx, state=(memory, False))) <= -self.release
+
+    def _level(self, ctx: TriggerContext) -> float:
+        return ask_level(self.policy, replace(ctx, state=ctx.state[0]))

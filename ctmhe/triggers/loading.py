@@ -12,16 +12,33 @@ from types import ModuleType
 from typing import Any
 
 from ctmhe.errors import InputError, TriggerError
-from ctmhe.triggers.base import Trigger, kind_of, trigger
-from ctmhe.triggers.compose import And, MaxInterval, MinInterval, Or
-from ctmhe.triggers.innovation import Innovation
-from ctmhe.triggers.threshold import SendOnDelta
+from ctmhe.triggers.answers import kind_of
+from ctmhe.triggers.base import Trigger, trigger
+from ctmhe.triggers.budget import Budget, DutyCycle, TokenBucket
+from ctmhe.triggers.compose import And, Hysteresis, MaxInterval, MinInterval, Or
+from ctmhe.triggers.covariance import CovarianceBound, CovarianceSelfTriggered
+from ctmhe.triggers.crossing import LevelCrossing
+from ctmhe.triggers.energy import InnovationEnergy
+from ctmhe.triggers.gaps import GeometricGaps, Jittered, LinearGaps, Poisson
+from ctmhe.triggers.information import Excitation
+from ctmhe.triggers.innovation import Innovation, Stochastic
+from ctmhe.triggers.phases import During, Phases
+from ctmhe.triggers.threshold import Deadband, SendOnArea, SendOnDelta, SendOnSlope
 from ctmhe.triggers.timing import Periodic, Scheduled
 
 GROUP = "ctmhe.triggers"
-BUILT_IN: dict[str, type[Trigger]] = {
-    kind.__name__: kind for kind in (Periodic, Scheduled, SendOnDelta, Innovation, MinInterval, MaxInterval)
-}
+POLICIES: tuple[type[Trigger], ...] = (
+    *(Periodic, Scheduled, Jittered, Poisson, LinearGaps, GeometricGaps),
+    *(SendOnDelta, SendOnArea, SendOnSlope, Deadband, LevelCrossing),
+    *(Innovation, InnovationEnergy, Stochastic),
+    *(CovarianceBound, CovarianceSelfTriggered, Excitation),
+    *(TokenBucket, DutyCycle, Budget),
+    *(MinInterval, MaxInterval, Hysteresis, During),
+)
+BUILT_IN: dict[str, type[Trigger]] = {kind.__name__: kind for kind in POLICIES}
+
+JOINED = ("any", "all", "phases")
+"""Keys of tables that join policies."""
 
 
 def load_trigger(location: str) -> Trigger:
@@ -78,9 +95,10 @@ def build_trigger(spec: str | Mapping[str, Any]) -> Trigger:
     Parameters
     ----------
     spec : str or mapping
-        A name; `{name = "SendOnDelta", delta = 0.05}`, the other keys being its arguments; or several joined:
-        `{any = [...]}` for `|` and `{all = [...]}` for `&`. Names are those of this package and of the entry-point
-        group `ctmhe.triggers`; files are not loaded from a configuration.
+        A name; `{name = "SendOnDelta", delta = 0.05}`, the other keys being its arguments, policies among them; or
+        several joined: `{any = [...]}` for `|`, `{all = [...]}` for `&`, and `{phases = [[2.0, ...], ...]}` for
+        `Phases`, whose list holds pairs of a time and a policy, and the last policy alone. Names are those of this
+        package and of the entry-point group `ctmhe.triggers`; files are not loaded from a configuration.
 
     Raises
     ------
@@ -91,18 +109,34 @@ def build_trigger(spec: str | Mapping[str, Any]) -> Trigger:
         spec = {"name": spec}
     if not isinstance(spec, Mapping):
         raise InputError(f"trigger: expected a name or a table, got {spec!r}")
-    for key, join in (("any", Or), ("all", And)):
+    for key in JOINED:
         if key in spec:
             parts = spec[key]
             if len(spec) > 1 or not isinstance(parts, (list, tuple)) or not parts:
                 raise InputError(f"trigger: {key} takes a list of policies and stands alone, got {dict(spec)!r}")
+            if key == "phases":
+                return Phases(*map(_phase, parts))
             policies = [build_trigger(part) for part in parts]
-            return policies[0] if len(policies) == 1 else join(*policies)
+            return policies[0] if len(policies) == 1 else (Or if key == "any" else And)(*policies)
     arguments = dict(spec)
     name = arguments.pop("name", None)
     if not isinstance(name, str):
-        raise InputError(f"trigger: a table needs name, any or all, got {dict(spec)!r}")
+        raise InputError(f"trigger: a table needs name, {', '.join(JOINED[:-1])} or phases, got {dict(spec)!r}")
+    arguments = {key: build_trigger(value) if _describes(value) else value for key, value in arguments.items()}
     return _as_policy(_named(name), f"trigger {name!r}", arguments)
+
+
+def _describes(value: Any) -> bool:
+    """Return whether an argument is a policy's table, not a mapping of signals to numbers."""
+    if not isinstance(value, Mapping):
+        return False
+    return isinstance(value.get("name"), str) or any(isinstance(value.get(key), (list, tuple)) for key in JOINED)
+
+
+def _phase(part: Any) -> Any:
+    if isinstance(part, (list, tuple)):
+        return part if len(part) != 2 else (part[0], build_trigger(part[1]))
+    return build_trigger(part)
 
 
 def _named(name: str) -> Any:

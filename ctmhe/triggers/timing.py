@@ -9,7 +9,7 @@ import numpy as np
 
 from ctmhe.errors import InputError
 from ctmhe.triggers.base import Trigger, TriggerContext
-from ctmhe.triggers.compose import positive
+from ctmhe.triggers.checks import positive
 from ctmhe.types import Array, finite_time
 
 SAME = 1e-9

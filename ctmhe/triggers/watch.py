@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ctmhe.triggers.base import Trigger, TriggerContext, ask_level, ask_time, ask_yes, initial_memory, kind_of, remember
+from ctmhe.triggers.answers import ask_level, ask_time, ask_yes, initial_memory, kind_of, remember, settle
+from ctmhe.triggers.base import Trigger, TriggerContext
 from ctmhe.triggers.compose import And, Combined
 from ctmhe.triggers.timing import tolerance
 
@@ -97,7 +98,15 @@ class Watch:
         `before` is the context at the sample, `after` the one that knows of it and of the new estimate.
         """
         state = self._remember(state, before, fired=True)
-        spent = WatchState(tuple(replace(row, yes=False) for row in state.standings))
+        rows = zip(self.leaves, state.standings, strict=True)
+        spent = WatchState(
+            tuple(
+                replace(row, yes=False)
+                if type(leaf).after_sample is Trigger.after_sample
+                else replace(row, yes=False, memory=settle(leaf, after, row.memory))
+                for leaf, row in rows
+            )
+        )
         state = self._plan(spent, after, earliest=after.t + 2 * tolerance(after.t))
         if self.level(state, after) < 0:
             return state
@@ -108,6 +117,11 @@ class Watch:
                 for leaf, kind, row in rows
             )
         )
+
+    def silenced(self, state: WatchState) -> WatchState:
+        """Return the state in which no guard speaks until policies are asked again, at the next monitoring time."""
+        rows = zip(self.kinds, state.standings, strict=True)
+        return WatchState(tuple(replace(row, silent=True) if kind == "guard" else row for kind, row in rows))
 
     def _remember(self, state: WatchState, ctx: TriggerContext, fired: bool) -> WatchState:
         rows = zip(self.leaves, state.standings, strict=True)
@@ -143,7 +157,9 @@ def _leaves(policy: Trigger) -> Iterator[Trigger]:
 def _level(leaf: Trigger, kind: str, row: Standing, ctx: TriggerContext, t: float) -> float:
     """Return one elementary policy's level at `ctx`, with named times judged at `t`."""
     if kind == "guard":
-        return -np.inf if row.silent else ask_level(leaf, replace(ctx, state=row.memory))
+        if row.silent:
+            return -np.inf
+        return ask_level(leaf, ctx if row.memory is None else replace(ctx, state=row.memory))
     agrees = row.yes if kind == "fires" else t >= row.due - tolerance(t)
     return np.inf if agrees else -np.inf
 

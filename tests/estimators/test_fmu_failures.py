@@ -51,7 +51,7 @@ def run(failure: int, *, until: float = 15.0, kicked: float = 7.0, fmi: int = 2,
         )
     instances = model.evaluator().counts()[2]
     model.close()
-    return found.events_to_pandas(), instances
+    return found.solves_to_pandas(), instances
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_a_run_of_300_samples_survives_an_fmu_that_fails_in_its_middle(undisturb
     """Before: the same numbers. Meanwhile: marked. A horizon after the state has come back: as good as without."""
     events, instances = run(failure, fmi=fmi)
     assert len(events) == 300
-    t, success = events["sample_time"].to_numpy(), events["success"].to_numpy()
+    t, success = events["solve_time"].to_numpy(), events["success"].to_numpy()
     states = ["x_hat.angle", "x_hat.rate"]
     off = np.abs(events[states].to_numpy() - undisturbed[states].to_numpy()).max(axis=1)
     beyond = t[np.abs(undisturbed["x_hat.angle"].to_numpy()) > LIMIT]

@@ -229,3 +229,21 @@ def test_the_level_is_recorded(mhe):
         expected = abs(y[k] - last[before][-1]) - 0.3 if before.any() else np.inf
         assert result.dataset["level"].to_numpy()[k] == pytest.approx(expected, abs=1e-12)
     assert (run(SWING, mhe, Periodic(0.7), until=2.0).dataset["level"].to_numpy()[1:2] == -np.inf).all()
+
+
+def test_a_guard_that_comes_back_at_once_is_asked_at_monitoring_times_only(mhe, caplog):
+    """Protected by default: no more than four samples a monitoring step, counted, and said once, by name."""
+
+    class Restless(Trigger):
+        def guard(self, ctx):
+            return ctx.elapsed - 1e-6
+
+        def __repr__(self):
+            return "Restless()"
+
+    result = run(SWING, mhe, Restless(), until=2.0)
+    per_step, _ = np.histogram(result.sample_times, bins=np.append(result.t, np.inf) - 1e-9)
+    assert per_step.max() <= 4
+    assert result.hushed >= len(result.t) - 2
+    assert caplog.text.count("policy Restless(): its guard reaches zero again") == 1
+    assert "MinInterval" in caplog.text

@@ -204,5 +204,5 @@ def test_a_network_wraps_a_channel_and_knows_the_outputs(mhe):
     """No network within a network, no quantum for an output that does not exist."""
     with pytest.raises(InputError, match="expected WholeSignal"):
         Network(Network(SingleSample()))
-    with pytest.raises(InputError, match="unknown output 'presure'.*pressure"):
+    with pytest.raises(InputError, match=r"unknown output 'presure'.*pressure"):
         run(mhe, Periodic(0.2), Network(SingleSample(), quantum={"presure": 0.1}))

@@ -1,0 +1,53 @@
+"""Policies of information: sample when the parameters are excited."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from ctmhe.errors import InputError
+from ctmhe.triggers.base import Trigger, TriggerContext
+from ctmhe.types import finite_time
+
+
+class ExcitationMeasure(Protocol):
+    """How much a sample at `ctx.t` would tell about the parameters: a number that is larger when it is more.
+
+    A function of the context, or an object with `__call__`. It sees what a policy sees, and must be the same for the
+    same context; one that pickles (a function of a module, a frozen dataclass) can go to worker processes.
+    """
+
+    def __call__(self, ctx: TriggerContext, /) -> float:
+        """Return the excitation, in the measure's own unit; not NaN."""
+        ...
+
+
+@dataclass(frozen=True, repr=False)
+class Excitation(Trigger):
+    """Sample while the parameters are excited: measure(ctx) - level >= 0.
+
+    Estimates of parameters improve only with data that depend on them: persistent excitation, as thesis ch. 5 demands
+    of the windows used for them. The measure is the caller's; see `ExcitationMeasure`.
+
+    Parameters
+    ----------
+    measure : callable ctx -> float
+    level : float
+        Threshold, finite, in the measure's unit.
+    """
+
+    measure: ExcitationMeasure
+    level: float
+
+    def __post_init__(self) -> None:
+        if not callable(self.measure):
+            raise InputError(f"Excitation: measure must be a function of the context, got {self.measure!r}")
+        try:
+            level = finite_time(self.level, "")
+        except InputError:
+            raise InputError(f"Excitation: level must be a finite number, got {self.level!r}") from None
+        object.__setattr__(self, "level", level)
+
+    def guard(self, ctx: TriggerContext) -> float:
+        """Return the excitation above the level."""
+        return self.measure(ctx) - self.level
