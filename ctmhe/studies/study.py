@@ -83,7 +83,7 @@ class Study:
             self.design = self.design * as_design(design)
         self.seeds = _seeds(seeds)
         _check_case(case, self.design)
-        self.name = name or getattr(case, "__name__", type(case).__name__)
+        self.name = name or _case_name(case).rpartition(".")[2]
         self.metrics = (metrics,) if isinstance(metrics, str) else None if metrics is None else tuple(metrics)
         self.trajectories, self.version = bool(trajectories), str(version)
         self.store = None if folder is None else Store(folder)
@@ -261,7 +261,8 @@ class Study:
 
 
 def _case_name(case: Callable[..., Any]) -> str:
-    kind = case if hasattr(case, "__qualname__") else type(getattr(case, "func", case))
+    case = getattr(case, "func", case)  # of a partial
+    kind = case if hasattr(case, "__qualname__") else type(case)
     return f"{kind.__module__}.{kind.__qualname__}"
 
 
