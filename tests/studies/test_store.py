@@ -16,7 +16,7 @@ import pandas as pd
 import pytest
 import xarray as xr
 
-from ctmhe import Periodic, SendOnDelta, Study
+from ctmhe import Periodic, SendOnDelta, Study, StudyResult
 from ctmhe.errors import InputError
 from ctmhe.studies import status
 from tests.studies.cases import Reactor, draw, troubled
@@ -66,6 +66,10 @@ def test_a_finished_run_is_not_done_again_and_an_extended_study_does_what_is_new
     assert runs_of(Study(Line(), grid, 3, folder=tmp_path)) == 2
     assert runs_of(Study(Line(), more, 3, folder=tmp_path)) == 3
     same(Study(Line(), more, 3, folder=tmp_path).result(), Study(Line(), more, 3).run())
+    same(StudyResult.load(tmp_path), Study(Line(), more, 3).run())
+    whole = tmp_path / "whole"
+    assert runs_of(Study(Line(), {"gain": [1, 2, 3]}, 3, folder=whole)) == 9
+    assert runs_of(Study(Line(), {"gain": [0.5, 1, 2, 3]}, 3, folder=whole)) == 3  # 1 is called 1.0 now
     stored = pd.read_parquet(tmp_path / "table.parquet")
     pd.testing.assert_frame_equal(stored, Study(Line(), more, 3, folder=tmp_path).result().table)
 
