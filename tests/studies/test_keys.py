@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from ctmhe import MaxInterval, Periodic, SendOnDelta, trigger
+from ctmhe import MaxInterval, OdePlant, Periodic, SendOnDelta, trigger
 from ctmhe.models.library import batch_reactor
 from ctmhe.studies.keys import describe, digest
 from fmus.build import build
@@ -160,6 +160,19 @@ def test_equal_values_have_equal_keys():
     assert describe(array[::2]) == describe(array[::2].copy())
     assert describe(oscillator_mhe()) == describe(oscillator_mhe())
     assert digest([array]) == digest([array.copy()])
+
+
+def test_a_plant_that_was_used_has_the_key_that_it_had():
+    """Where it stands is no part of what it is; its model and tolerances are."""
+    plant = OdePlant(batch_reactor())
+    before = describe(plant)
+    plant.start(0.0, np.array([3.0, 1.0]))
+    plant.advance(0.5, np.zeros(0), np.zeros(0), np.zeros(3))
+    assert describe(plant) == before
+    assert (
+        len({before, describe(OdePlant(batch_reactor(), rtol=1e-6)), describe(OdePlant(batch_reactor(noise=False)))})
+        == 3
+    )
 
 
 def test_what_refers_to_itself_has_a_key_too():

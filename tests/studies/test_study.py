@@ -171,6 +171,15 @@ def test_a_study_that_cannot_be_is_told_at_once(make, message):
         make()
 
 
+def test_progress_counts_what_is_done_already(tmp_path, capsys):
+    """Shown when asked for only."""
+    Study(draw, {"gain": [1.0]}, 3, folder=tmp_path).run()
+    assert not capsys.readouterr().err
+    Study(draw, {"gain": [1.0, 2.0]}, 3, folder=tmp_path).run(progress=True)
+    shown = capsys.readouterr().err
+    assert "draw:  50%" in shown and "3/6" in shown and "6/6" in shown and "run/s" in shown
+
+
 def test_a_partial_fixes_what_is_no_parameter():
     """`functools.partial` is how; it is part of the key."""
     a, b = (Study(partial(draw, gain=gain), seeds=2).run() for gain in (1.0, 2.0))
