@@ -61,11 +61,11 @@ def resume(
 @app.command()
 def status(folder: Folder) -> None:
     """Print how far a study is; exit code 1 when runs failed."""
+    from ctmhe.studies import StudyResult
     from ctmhe.studies import status as status_of
-    from ctmhe.studies.report import load_result
 
     found = status_of(folder)
-    result = load_result(folder)
+    result = StudyResult.load(folder)
     typer.echo(f"{result.name}: {found}")
     if found.missing:
         if found.rate > 0:
@@ -89,9 +89,10 @@ def report(
     ] = None,
 ) -> None:
     """Write a study, finished or not, as one HTML page with its figures and tables."""
-    from ctmhe.studies.report import load_result, write_report
+    from ctmhe.studies import StudyResult
+    from ctmhe.studies.report import write_report
 
-    result = load_result(folder)
+    result = StudyResult.load(folder)
     chosen = None if baseline is None else baseline_of(baseline, result)
     typer.echo(f"written: {write_report(result, out or folder / 'report.html', baseline=chosen)}")
 

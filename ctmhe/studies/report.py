@@ -13,8 +13,8 @@ import numpy as np
 from ctmhe.errors import InputError
 from ctmhe.plotting.style import NAMES, title
 from ctmhe.studies.figures import Roles, numeric, pictures, varied_in
-from ctmhe.studies.results import StudyResult, make_table
-from ctmhe.studies.store import Store, replacing
+from ctmhe.studies.results import StudyResult
+from ctmhe.studies.store import replacing
 
 SHOWN = ("online_rms", "retrospective_rms", "samples", "solves", "messages_lost", "longest_gap", "solve_ms_median")
 ROWS = 200
@@ -69,30 +69,13 @@ def write_report(result: StudyResult | str | Path, path: str | Path, *, baseline
         For a folder without a study, and an unknown baseline.
     """
     if not isinstance(result, StudyResult):
-        result = load_result(result)
+        result = StudyResult.load(result)
     path = Path(path)
     page = make_page(result, baseline)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as temporary:
         temporary.write_text(page, encoding="utf-8")
     return path
-
-
-def load_result(folder: str | Path) -> StudyResult:
-    """Return the finished runs in the folder of a study, from its files alone.
-
-    Raises
-    ------
-    InputError
-        If there is no study.
-    """
-    store = Store(folder)
-    about = store.read_about()
-    if about is None:
-        raise InputError(f"study: there is no study in {str(folder)!r} (no study.json)")
-    rows = store.read(about["keys"])
-    ordered = [rows[key] for key in about["keys"] if key in rows]
-    return make_table(ordered, tuple(about["parameters"]), about["metrics"], about["name"], store)
 
 
 def make_page(result: StudyResult, baseline: Any = None) -> str:

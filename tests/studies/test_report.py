@@ -13,7 +13,7 @@ import pytest
 from ctmhe.errors import InputError
 from ctmhe.studies import Study, StudyResult
 from ctmhe.studies.figures import Roles, pictures
-from ctmhe.studies.report import load_result, make_page, write_report
+from ctmhe.studies.report import make_page, write_report
 
 matplotlib.use("agg")
 HOSTILE = "<script>alert('$')</script> & $}$"
@@ -114,7 +114,7 @@ def test_a_study_that_is_not_finished_says_so(tmp_path):
     """What is there is reported."""
     Study(case, {"policy": ["even", "delta"]}, 2, folder=tmp_path / "s").run()
     next((tmp_path / "s" / "runs").glob("*.parquet")).unlink()
-    assert "3 of 4 runs are finished" in make_page(load_result(tmp_path / "s"))
+    assert "3 of 4 runs are finished" in make_page(StudyResult.load(tmp_path / "s"))
 
 
 def test_the_baseline_can_be_chosen():
