@@ -31,7 +31,7 @@ TABLES: dict[str, tuple[str, ...]] = {
     "estimator": ESTIMATOR,
     "guess": (),  # names of states and parameters
     "trigger": (),
-    "channel": ("kind", "every"),
+    "channel": ("kind",),
 }
 
 
