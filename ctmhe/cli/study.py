@@ -116,14 +116,17 @@ def _perform(study: Study, workers: int, dask: str | None, retry_failed: bool = 
     if before.done:
         typer.echo(f"  {before.done} runs are there already")
     start = time.monotonic()
+    executor = _client(dask) if dask else None
     try:
-        executor = _client(dask) if dask else None
         bar = sys.stderr.isatty()
         result = study.run(workers=workers, executor=executor, progress=bar, retry_failed=retry_failed)
     except KeyboardInterrupt:
         found = study.status()
         typer.echo(f"\nstopped: {found}. Go on with\n  ctmhe study resume {folder}", err=True)
         raise typer.Exit(130) from None
+    finally:
+        if executor is not None:
+            executor.close()
     done = len(result.table) - (before.done - before.failed * retry_failed)
     typer.echo(f"\n{done} run{'s' * (done != 1)} in {_span(time.monotonic() - start)}\n")
     typer.echo(_summary(result))
