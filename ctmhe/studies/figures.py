@@ -30,6 +30,8 @@ ERRORS = ("online_rms", "retrospective_rms", "ise")
 EFFORTS = ("samples", "solves", "messages", "bytes_sent")
 FAMILIES = 9
 """So many lines can be told apart."""
+PAIRS = 24
+"""So many differences stand one under the other; the table has all of them."""
 RUNS = 40
 """So many trajectories a family are read for distributions."""
 
@@ -95,6 +97,7 @@ def pictures(result: StudyResult, roles: Roles, differences: Any = None) -> list
     drawn: list[Picture | None] = []
     by, along = families(table, roles)
     error, effort = roles.error, roles.effort
+    every = over(roles, [*by, *along])
     if error and effort:
         count = table.groupby(by, dropna=False).ngroups if by else 1
         if count <= FAMILIES:
@@ -103,7 +106,7 @@ def pictures(result: StudyResult, roles: Roles, differences: Any = None) -> list
                     lambda axes: plot_error_against_samples(
                         table, axes, error=error, samples=effort, by=by, parameter=along
                     ),
-                    f"{_capital(title(error))} against {title(effort)}: means over the seeds with 95 % intervals.",
+                    f"{_capital(title(error))} against {title(effort)}: means over the seeds{every} with 95 % intervals.",
                 )
             )
         names = [*roles.texts, *roles.numbers]
@@ -119,18 +122,16 @@ def pictures(result: StudyResult, roles: Roles, differences: Any = None) -> list
             )
     if error and len(roles.numbers) >= 2:
         x, y = roles.numbers[:2]
-        others = [name for name in (*roles.texts, *roles.numbers) if name not in (x, y)]
-        more = f", averaged over {', '.join(others)} too" if others else ""
         rows = table[y].nunique()
         if rows <= 40 and table[x].nunique() <= 60 and len(table[[x, y]].drop_duplicates()) > max(rows, 3):
             drawn.append(
                 draw(
                     lambda axes: plot_heatmap(table, axes, x=x, y=y, value=error),
-                    f"{_capital(title(error))} over {x} and {y}: mean over the seeds{more}.",
+                    f"{_capital(title(error))} over {x} and {y}: mean over the seeds{over(roles, [x, y])}.",
                     height=min(9.0, max(2.4, 1.2 + 0.42 * rows)),
                 )
             )
-    if differences is not None and 0 < len(differences) <= 40:
+    if differences is not None and 0 < len(differences) <= PAIRS:
         compared = plain(differences, result.parameters)
         names = [name for name in result.parameters if compared[name].nunique() > 1] or list(result.parameters)
         drawn.append(
@@ -146,11 +147,18 @@ def pictures(result: StudyResult, roles: Roles, differences: Any = None) -> list
 
 
 def families(table: Any, roles: Roles) -> tuple[list[str], list[str]]:
-    """Return the columns that tell families apart, and those that move along a family's line."""
-    if roles.texts or len(roles.numbers) < 2:
-        return roles.texts, roles.numbers
-    few = min(roles.numbers, key=lambda name: table[name].nunique())
-    return [few], [name for name in roles.numbers if name != few]
+    """Return the columns that tell families apart, and the one that moves along a family's line.
+
+    Labels tell apart, else the number with the fewest values where there are two; the line follows the number that
+    changes the effort most.
+    """
+    by = roles.texts
+    if not by and len(roles.numbers) > 1:
+        by = [min(roles.numbers, key=lambda name: table[name].nunique())]
+    rest = [name for name in roles.numbers if name not in by]
+    if len(rest) < 2 or roles.effort is None:
+        return by, rest
+    return by, [max(rest, key=lambda name: np.ptp(table.groupby(name)[roles.effort].mean().to_numpy(dtype=float)))]
 
 
 def draw(plot: Callable[[Any], Any], caption: str, height: float = 4.0) -> Picture | None:
@@ -183,6 +191,11 @@ def plain(table: Any, parameters: Any) -> Any:
     for name in parameters:
         shown[name] = [value.replace("$", r"\$") if isinstance(value, str) else value for value in shown[name]]
     return shown
+
+
+def over(roles: Roles, shown: list[str]) -> str:
+    """Return, in words, what else a mean is taken over."""
+    return "".join(f" and {name}" for name in (*roles.texts, *roles.numbers) if name not in shown)
 
 
 def _capital(text: str) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ctmhe.errors import InputError
 from ctmhe.plotting.style import NAMES, title
-from ctmhe.studies.figures import Roles, numeric, pictures, varied_in
+from ctmhe.studies.figures import Picture, Roles, numeric, pictures, varied_in
 from ctmhe.studies.results import StudyResult
 from ctmhe.studies.store import replacing
 
@@ -86,21 +86,21 @@ def make_page(result: StudyResult, baseline: Any = None) -> str:
     roles = Roles.of(result)
     if len(result.table) and len(result.failed) < len(result.table):
         differences, said = _differences(result, roles, baseline)
+        shown = pictures(result, roles, differences)
+        parts += ["<h2>Figures</h2>"] * bool(shown) + [_figure(picture) for picture in shown]
         parts += [_results(result), _compared(differences, said, roles, result)]
-        parts.append("<h2>Figures</h2>")
-        for picture in pictures(result, roles, differences):
-            data = b64encode(picture.svg).decode("ascii")
-            caption = escape(picture.caption)
-            parts.append(
-                f'<figure><img alt="{caption}" src="data:image/svg+xml;base64,{data}">'
-                f"<figcaption>{caption}</figcaption></figure>"
-            )
     parts += [_failures(result), _again(result)]
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f"<title>{name}</title><style>{STYLE}</style></head>\n<body>\n" + "\n".join(parts) + "\n</body></html>\n"
     )
+
+
+def _figure(picture: Picture) -> str:
+    data, caption = b64encode(picture.svg).decode("ascii"), escape(picture.caption)
+    image = f'<img alt="{caption}" src="data:image/svg+xml;base64,{data}">'
+    return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
 
 
 def _headline(result: StudyResult, about: Mapping[str, Any]) -> str:
