@@ -97,7 +97,7 @@ def pictures(result: StudyResult, roles: Roles, differences: Any = None) -> list
     drawn: list[Picture | None] = []
     by, along = families(table, roles)
     error, effort = roles.error, roles.effort
-    every = over(roles, [*by, *along])
+    every = f"means over the seeds{over(roles, [*by, *along])} with 95 % intervals"
     if error and effort:
         count = table.groupby(by, dropna=False).ngroups if by else 1
         if count <= FAMILIES:
@@ -106,7 +106,7 @@ def pictures(result: StudyResult, roles: Roles, differences: Any = None) -> list
                     lambda axes: plot_error_against_samples(
                         table, axes, error=error, samples=effort, by=by, parameter=along
                     ),
-                    f"{_capital(title(error))} against {title(effort)}: means over the seeds{every} with 95 % intervals.",
+                    f"{_capital(title(error))} against {title(effort)}: {every}.",
                 )
             )
         names = [*roles.texts, *roles.numbers]
