@@ -38,7 +38,7 @@ class Design:
 
     def __post_init__(self) -> None:
         for name in self.parameters:
-            if not isinstance(name, str) or not name.isidentifier():
+            if not isinstance(name, str) or not name.replace(".", "_").isidentifier():  # dots: keys of described cases
                 raise InputError(f"design: a parameter is a keyword of the case, {name!r} cannot be one")
             if name in RESERVED:
                 raise InputError(f"design: a parameter cannot be called {name!r}; choose another name")

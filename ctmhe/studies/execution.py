@@ -7,6 +7,7 @@ task is a few numbers. A worker that does not know the book yet says so and is a
 from __future__ import annotations
 
 import logging
+import os
 import pickle
 import re
 import threading
@@ -217,6 +218,17 @@ def _work(digest: str, content: Any, parameters: tuple[str, ...], task: Task) ->
     return perform(case, dict(zip(parameters, values[task.point], strict=True)), task)
 
 
+def _follow(parent: int) -> None:
+    """Leave when the process that made this one is gone: killed, it cannot say so."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(1.0)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 class _Pool:
     """Where tasks are submitted to; `width` of them at a time."""
 
@@ -250,7 +262,9 @@ class _Processes(_Pool):
             from joblib.externals.loky import get_reusable_executor
         except ImportError:
             raise MissingExtra("joblib", "study", "running a study on several workers") from None
-        self.executor = get_reusable_executor(max_workers=self.workers, timeout=60, env=ONE_THREAD)
+        self.executor = get_reusable_executor(
+            max_workers=self.workers, timeout=60, env=ONE_THREAD, initializer=_follow, initargs=(os.getpid(),)
+        )
 
     def abort(self) -> None:
         self.executor.shutdown(wait=True, kill_workers=True)  # pyright: ignore

@@ -99,6 +99,9 @@ class _Description:
         if callable(getattr(value, "serialize", None)) and type(value).__module__.startswith("casadi"):
             return f"{_name(type(value))} {sha256(value.serialize().encode()).hexdigest()}"
         kind = self.of(type(value))
+        if type(value).__module__.startswith("ctmhe.") and hasattr(value, "advance") and "model" in vars(value):
+            # a plant: where it stands at the moment is no part of what it is
+            return f"{kind} {self.of({name: part for name, part in vars(value).items() if not name.startswith('_')})}"
         try:
             reduce = copyreg.dispatch_table.get(type(value))
             reduced = reduce(value) if reduce else value.__reduce_ex__(4)

@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ctmhe.errors import InputError
-from ctmhe.studies.store import Row, Store
+from ctmhe.studies.store import Row, Store, finished
 from ctmhe.types import Array
 
 if TYPE_CHECKING:
@@ -43,6 +44,26 @@ class StudyResult:
     def failed(self) -> pd.DataFrame:
         """The runs that ended with an error."""
         return self.table.loc[self.table["error"] != ""]
+
+    @classmethod
+    def load(cls, folder: str | Path) -> StudyResult:
+        """Read the finished runs of a study from its folder alone.
+
+        Raises
+        ------
+        InputError
+            If there is no study.
+        """
+        store = Store(folder)
+        about = store.need_about()
+        parameters, seeds = tuple(about["parameters"]), about["seeds"]
+        rows = finished(store, about["keys"], bool(about["trajectories"]))
+        ordered = []
+        for i, key in enumerate(about["keys"]):
+            if key in rows:
+                point = dict(zip(parameters, about["points"][i // len(seeds)], strict=True))
+                ordered.append(rows[key] | point)
+        return make_table(ordered, parameters, about["metrics"], about["name"], store)
 
     def summary(self, metric: str, by: str | Sequence[str] | None = None, *, confidence: float = 0.95) -> pd.DataFrame:
         """Return mean and confidence interval of a metric for each point.
@@ -131,7 +152,7 @@ class StudyResult:
             mean, _, low, high = interval(gap, confidence)
             better = gap > 0 if higher_is_better else gap < 0
             about = {"n": int(both.sum()), "dropped": int((~both).sum()), "difference": mean, "low": low, "high": high}
-            divisor = other[both].mean() if both.any() else np.nan
+            divisor = other[both].mean() if both.any() else 0.0
             about["ratio"] = mine[both].mean() / divisor if divisor else np.nan
             rows.append({**labels, **about, "better": better.mean() if both.any() else np.nan})
         import pandas as pd

@@ -112,6 +112,13 @@ class Store:
             raise InputError(f"study: {path} is not the file of a study that this version reads ({FORMAT!r})")
         return about
 
+    def need_about(self) -> dict[str, Any]:
+        """Return the same, or raise `InputError` where there is no study."""
+        about = self.read_about()
+        if about is None:
+            raise InputError(f"study: there is no study in {str(self.folder)!r} (no study.json)")
+        return about
+
     def write_about(self, about: Mapping[str, Any]) -> None:
         """Write `study.json`."""
         for part in ("runs", "trajectories") if about["trajectories"] else ("runs",):
@@ -164,9 +171,7 @@ def status(folder: str | Path) -> Status:
         If there is no study.
     """
     store = Store(folder)
-    about = store.read_about()
-    if about is None:
-        raise InputError(f"study: there is no study in {str(folder)!r} (no study.json)")
+    about = store.need_about()
     return status_of(store, list(about["keys"]), bool(about["trajectories"]))
 
 

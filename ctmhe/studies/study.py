@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ctmhe.errors import InputError
-from ctmhe.studies.design import RESERVED, Design, as_design, named
+from ctmhe.studies.design import RESERVED, Design, Label, as_design, named
 from ctmhe.studies.execution import Outcome, Task, execute
 from ctmhe.studies.keys import describe, digest
 from ctmhe.studies.results import StudyResult, make_table
@@ -83,7 +83,7 @@ class Study:
             self.design = self.design * as_design(design)
         self.seeds = _seeds(seeds)
         _check_case(case, self.design)
-        self.name = name or getattr(case, "__name__", type(case).__name__)
+        self.name = name or _case_name(case).rpartition(".")[2]
         self.metrics = (metrics,) if isinstance(metrics, str) else None if metrics is None else tuple(metrics)
         self.trajectories, self.version = bool(trajectories), str(version)
         self.store = None if folder is None else Store(folder)
@@ -189,7 +189,8 @@ class Study:
         keys: dict[str, Task] = {}
         rows = zip(self.design.labels, self.design.values, strict=True)
         for point, (labels, values) in enumerate(rows):
-            here = digest(common, dict(zip(self.design.parameters, labels, strict=True)), *map(describe, values))
+            named_so = [f"{name}={_stable(label)}" for name, label in zip(self.design.parameters, labels, strict=True)]
+            here = digest(common, *sorted(named_so), *map(describe, values))
             for seed in self.seeds:
                 key = digest(here, str(seed))
                 kept = None
@@ -208,11 +209,15 @@ class Study:
         taken = [name for name in values if name in (*RESERVED, *self.design.parameters)]
         if taken:
             values, error = {}, f"InputError: a metric cannot be called {taken[0]!r}: the table has such a column"
+        return self._labelled(task, {**values, "error": error, "seconds": outcome.seconds, "key": task.key})
+
+    def _labelled(self, task: Task, row: Row) -> Row:
+        """Return a row with the labels as they are now: a column of whole numbers may have become one of numbers."""
         labels = dict(zip(self.design.parameters, self.design.labels[task.point], strict=True))
-        return {**labels, "seed": task.seed, **values, "error": error, "seconds": outcome.seconds, "key": task.key}
+        return row | labels | {"seed": task.seed}
 
     def _result(self, rows: Mapping[str, Row]) -> StudyResult:
-        ordered = [rows[key] for key in self._keys if key in rows]
+        ordered = [self._labelled(task, rows[key]) for key, task in self._keys.items() if key in rows]
         return make_table(ordered, self.design.parameters, self.metrics, self.name, self.store)
 
     def _about(self) -> dict[str, Any]:
@@ -260,8 +265,14 @@ class Study:
         return self.store
 
 
+def _stable(label: Label) -> str:
+    """Return a label as it goes into a key: 1 and 1.0 are one."""
+    return repr(float(label)) if isinstance(label, (int, float)) and not isinstance(label, bool) else str(label)
+
+
 def _case_name(case: Callable[..., Any]) -> str:
-    kind = case if hasattr(case, "__qualname__") else type(getattr(case, "func", case))
+    case = getattr(case, "func", case)  # of a partial
+    kind = case if hasattr(case, "__qualname__") else type(case)
     return f"{kind.__module__}.{kind.__qualname__}"
 
 

@@ -51,6 +51,8 @@ def read_trajectory(path: Path) -> Run:
     """
     if not path.is_file():
         raise InputError(f"study: there is no trajectory {path.name}; run the study with trajectories=True")
+    if not zipfile.is_zipfile(path):
+        raise InputError(f"study: {path.name} cannot be read as Zarr: it is no zip file")
     try:
         from zarr.storage import ZipStore
     except ImportError:
@@ -60,7 +62,7 @@ def read_trajectory(path: Path) -> Run:
     try:
         with ZipStore(path, mode="r") as store:
             data = xr.open_zarr(store, consolidated=False, decode_times=False, chunks=None).load()
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError) as error:
         raise InputError(f"study: {path.name} cannot be read as Zarr: {error}") from error
     if data.attrs.get("format") != FORMAT:
         raise InputError(f"study: {path.name} has format {data.attrs.get('format')!r}, this version reads {FORMAT!r}")

@@ -137,7 +137,7 @@ def find_threshold(
                 high, gap_high = middle, here
     import pandas as pd
 
-    best = min(rows, key=lambda row: abs(row["mean"] - wanted))
+    best = min(reversed(rows), key=lambda row: abs(row["mean"] - wanted))
     reached = abs(best["mean"] - wanted) <= slack
     if not _monotone(rows, parameter):
         message += f"; {metric} is not monotone in {parameter}: there may be other solutions"

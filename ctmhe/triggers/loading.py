@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from difflib import get_close_matches
 from importlib.metadata import entry_points
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from ctmhe.errors import InputError, TriggerError
@@ -52,26 +53,40 @@ def load_trigger(location: str) -> Trigger:
     TriggerError
         If the file fails when executed, or the name is not a policy.
     """
+    module, name = execute_file(location, "trigger")
+    if not hasattr(module, name):
+        found = [key for key, value in vars(module).items() if _is_policy(value, module.__name__)]
+        raise InputError(f"trigger {location!r}: no {name!r} in it. Policies there: {', '.join(found) or 'none'}")
+    return _as_policy(getattr(module, name), f"trigger {location!r}", {})
+
+
+def execute_file(location: str, what: str) -> tuple[ModuleType, str]:
+    """Execute the file of `file.py:Name`; return its module and the name, which may be missing in it.
+
+    Raises
+    ------
+    InputError
+        If the text is not `file.py:Name`, or there is no such file.
+    TriggerError
+        If the file fails when executed.
+    """
     file, colon, name = location.rpartition(":")
     path = Path(file)
     if not colon or not name or path.suffix != ".py":
-        raise InputError(f"trigger {location!r}: expected file.py:Name")
+        raise InputError(f"{what} {location!r}: expected file.py:Name")
     if not path.is_file():
-        raise InputError(f"trigger {location!r}: no file {file!r}")
+        raise InputError(f"{what} {location!r}: no file {file!r}")
     spec = importlib.util.spec_from_file_location(f"ctmhe_user_{path.stem}", path)
     if spec is None or spec.loader is None:
-        raise InputError(f"trigger {location!r}: {file!r} cannot be imported")
+        raise InputError(f"{what} {location!r}: {file!r} cannot be imported")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     try:
         spec.loader.exec_module(module)
     except Exception as error:
         del sys.modules[spec.name]
-        raise TriggerError(f"trigger {location!r}: {file} failed: {type(error).__name__}: {error}") from error
-    if not hasattr(module, name):
-        found = [key for key, value in vars(module).items() if _is_policy(value, module.__name__)]
-        raise InputError(f"trigger {location!r}: no {name!r} in {file}. Policies there: {', '.join(found) or 'none'}")
-    return _as_policy(getattr(module, name), f"trigger {location!r}", {})
+        raise TriggerError(f"{what} {location!r}: {file} failed: {type(error).__name__}: {error}") from error
+    return module, name
 
 
 def build_trigger(spec: str | Mapping[str, Any]) -> Trigger:

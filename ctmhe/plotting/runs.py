@@ -1,4 +1,4 @@
-"""Figures of runs. Functions take and return Axes, and never call `show`."""
+"""Figures of one run: states with their estimates, outputs with their samples, the trigger's level, the gaps."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from ctmhe.errors import InputError, MissingExtra
+from ctmhe.plotting.style import SMALL, WIDTH, above_legend, ready
 from ctmhe.types import Array
 
-# Okabe and Ito's colours, told apart by colour-blind readers; line styles and widths tell them apart in grey.
 STYLES: dict[str, dict[str, Any]] = {
     "x_true": {"color": "#000000", "linestyle": "-", "linewidth": 1.1, "label": "true", "zorder": 3},
     "x_online": {"color": "#D55E00", "linestyle": "-", "linewidth": 2.6, "alpha": 0.6, "label": "online estimate"},
@@ -29,19 +29,21 @@ SAMPLED: dict[str, Any] = {
     "linestyle": "none",
     "label": "sampled",
 }
-PANEL = (7.2, 1.7)
+LEVEL = "#CC79A7"
+PANEL = (WIDTH, 1.7)
 """Width and height of one panel in inches."""
 
 
 def plot_run(dataset: Any, axes: Any = None) -> Any:
-    """Draw a run: every state with its estimates, every output with its samples, and the gaps between samples.
+    """Draw a run: every state with its estimates, every output with its samples, the trigger's level, the gaps.
 
     Parameters
     ----------
     dataset : xarray.Dataset
         `Run.dataset`.
     axes : array of Axes, optional
-        One for each state, one for each output, one for the gaps, in this order. Made when left out.
+        One for each state, one for each output, one for the level of a run that has one, one for the gaps, in this
+        order. Made when left out.
 
     Returns
     -------
@@ -57,21 +59,23 @@ def plot_run(dataset: Any, axes: Any = None) -> Any:
     """
     states = [str(name) for name in dataset["state"].to_numpy()]
     outputs = [str(name) for name in dataset["output"].to_numpy()]
-    needed = len(states) + len(outputs) + 1
+    level = has_level(dataset)
+    needed = len(states) + len(outputs) + level + 1
     if axes is None:
         axes = make_panels(needed)
     axes = np.atleast_1d(np.asarray(axes, dtype=object)).reshape(-1)
     if len(axes) < needed:
-        raise InputError(
-            f"plot: {needed} axes are needed for {len(states)} states, {len(outputs)} outputs, gaps; got {len(axes)}"
-        )
+        parts = f"{len(states)} states, {len(outputs)} outputs, {'level, ' if level else ''}gaps"
+        raise InputError(f"plot: {needed} axes are needed for {parts}; got {len(axes)}")
     for i, name in enumerate(states):
         plot_state(dataset, name, axes[i])
     for i, name in enumerate(outputs):
         plot_output(dataset, name, axes[len(states) + i])
+    if level:
+        plot_level(dataset, axes[needed - 2])
     plot_gaps(dataset, axes[needed - 1])
     for panel in (axes[0], axes[len(states)]):
-        above_legend(panel)
+        above_legend(panel, columns=4)
     return axes[:needed]
 
 
@@ -98,6 +102,26 @@ def plot_output(dataset: Any, name: str, axes: Any) -> Any:
     return axes
 
 
+def has_level(dataset: Any) -> bool:
+    """Return whether the trigger of a run had a level."""
+    return "level" in dataset and bool(np.isfinite(dataset["level"].to_numpy()).any())
+
+
+def plot_level(dataset: Any, axes: Any) -> Any:
+    """Draw the trigger's level, infinite values on the edge: it samples where zero is reached; return the Axes."""
+    t, level = dataset["time"].to_numpy(), dataset["level"].to_numpy()
+    finite = level[np.isfinite(level)]
+    low, high = min(0.0, *finite), max(0.0, *finite)
+    margin = 0.08 * (high - low) or 1.0
+    axes.plot(t, np.clip(level, low - margin, high + margin), color=LEVEL, linewidth=1.1)
+    axes.axhline(0.0, color="#000000", linewidth=0.9, linestyle=(0, (4, 2)))
+    mark_samples(dataset["sample_time"].to_numpy(), axes)
+    axes.set_ylim(low - 1.2 * margin, high + 1.2 * margin)
+    axes.set_xlim(t[0], t[-1])
+    axes.set_ylabel("level")
+    return axes
+
+
 def plot_gaps(dataset: Any, axes: Any) -> Any:
     """Draw the time between samples at every sample; return the Axes."""
     t, times, gaps = (dataset[key].to_numpy() for key in ("time", "sample_time", "gap"))
@@ -108,7 +132,7 @@ def plot_gaps(dataset: Any, axes: Any) -> Any:
     axes.set_xlim(t[0], t[-1])
     axes.set_ylabel("gap [s]")
     axes.annotate(
-        f"{len(times)} samples", (1.0, 1.02), xycoords="axes fraction", ha="right", va="bottom", fontsize="small"
+        f"{len(times)} samples", (1.0, 1.02), xycoords="axes fraction", ha="right", va="bottom", fontsize=SMALL
     )
     return axes
 
@@ -119,20 +143,6 @@ def mark_samples(times: Array, axes: Any) -> Any:
         times, 0.0, 0.06, transform=axes.get_xaxis_transform(), color=SAMPLED["color"], linewidth=0.9, label="sample"
     )
     return axes
-
-
-def above_legend(axes: Any) -> None:
-    """Put the legend in one line above the Axes, where it hides nothing."""
-    axes.legend(
-        loc="lower right",
-        bbox_to_anchor=(1.0, 1.0),
-        ncols=4,
-        frameon=False,
-        fontsize="small",
-        borderaxespad=0.1,
-        handlelength=2.4,
-        columnspacing=1.2,
-    )
 
 
 def label(dataset: Any, kind: str, name: str) -> str:
@@ -159,7 +169,6 @@ def make_panels(count: int) -> Any:
         panels[i].set_xlabel("time [s]")
         panels[i].tick_params(labelbottom=True)
     for axes in panels[:count]:
-        axes.grid(visible=True, color="#dddddd", linewidth=0.5)
-        axes.spines[["top", "right"]].set_visible(False)
+        ready(axes)
     figure.align_ylabels()
     return panels[:count]

@@ -1,4 +1,4 @@
-"""The command line: `ctmhe demo`, `estimate`, `fmu info`, `fmu build`, `reproduce`."""
+"""The command line: `ctmhe demo`, `estimate`, `fmu info`, `fmu build`, `study run`, `reproduce`."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Annotated
 
 import typer
 
+from ctmhe.cli import study
 from ctmhe.errors import CtmheError
 
 app = typer.Typer(
@@ -22,6 +23,7 @@ app = typer.Typer(
 )
 fmu_app = typer.Typer(help="Look into FMUs, and compile them.", no_args_is_help=True)
 app.add_typer(fmu_app, name="fmu")
+app.add_typer(study.app, name="study")
 
 
 def _version(value: bool) -> None:
@@ -148,7 +150,3 @@ def main() -> None:
         lines = f"ctmhe: {error}".splitlines()  # a compiler's words keep their lines
         typer.echo("\n".join(textwrap.fill(line, 100, break_long_words=False) for line in lines), err=True)
         raise SystemExit(1) from None
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,5 @@
+"""`python -m ctmhe.cli`."""
+
+from ctmhe.cli import main
+
+main()

@@ -1,0 +1,102 @@
+"""What figures need of a study's table: families, means over seeds with their intervals, the front."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
+
+from ctmhe.errors import InputError
+from ctmhe.types import Array
+
+Columns = str | Sequence[str] | None
+
+
+def columns_of(columns: Columns) -> list[str]:
+    """Return names of columns as a list."""
+    return [] if columns is None else [columns] if isinstance(columns, str) else list(columns)
+
+
+def require(table: Any, names: Sequence[str], what: str) -> None:
+    """Raise `InputError` for a column that the table does not have."""
+    for name in names:
+        if name not in table.columns:
+            near = get_close_matches(name, map(str, table.columns), n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else "."
+            raise InputError(f"{what}: no column {name!r}{hint} Columns: {', '.join(map(str, table.columns))}")
+
+
+def groups(table: Any, by: Columns) -> Iterator[tuple[str, Any]]:
+    """Yield (label, rows) for every combination of values in the columns `by`, in the order of first appearance."""
+    names = columns_of(by)
+    if not names:
+        yield "all", table
+        return
+    for key, rows in table.groupby(names, sort=False, dropna=False):
+        yield label(key if isinstance(key, tuple) else (key,), names), rows
+
+
+def label(values: Sequence[Any], names: Sequence[str]) -> str:
+    """Return a family's label: texts as they are, numbers with the name of their column."""
+    return ", ".join(
+        value if isinstance(value, str) else f"{name} = {number(value)}"
+        for name, value in zip(names, values, strict=True)
+    )
+
+
+def number(value: Any) -> str:
+    """Return a value of a table as short text."""
+    return f"{value:.3g}" if isinstance(value, (float, np.floating)) else str(value)
+
+
+def means(table: Any, by: Columns, metrics: Sequence[str], confidence: float = 0.95) -> Array:
+    """Return mean, lower, upper limit and number of runs for each group and metric, (groups, metrics, 4).
+
+    Student's interval of the mean over the runs whose metrics are all finite; NaN limits for a single run.
+    """
+    rows = []
+    for _, group in groups(table, by):
+        values = group[list(metrics)].to_numpy(dtype=float)
+        values = values[np.isfinite(values).all(axis=1)]
+        if len(values):
+            rows.append([interval(values[:, i], confidence) for i in range(len(metrics))])
+    return np.array(rows, dtype=float).reshape(len(rows), len(metrics), 4)
+
+
+def interval(values: Array, confidence: float = 0.95) -> tuple[float, float, float, int]:
+    """Return mean, lower and upper limit of Student's interval of the mean, and the number of values."""
+    from scipy.special import stdtrit
+
+    n = len(values)
+    mean = float(np.mean(values))
+    if n < 2:
+        return mean, np.nan, np.nan, n
+    half = float(stdtrit(n - 1, 0.5 + confidence / 2) * np.std(values, ddof=1) / np.sqrt(n))
+    return mean, mean - half, mean + half, n
+
+
+def count(numbers: Any) -> str:
+    """Return how many runs stand behind points: `n = 20` or `n = 18 to 20`."""
+    low, high = int(min(numbers)), int(max(numbers))
+    return f"n = {low}" if low == high else f"n = {low} to {high}"
+
+
+def non_dominated(points: Any) -> Array:
+    """Return which points no other point beats, (n,) of bool, all columns to be minimised.
+
+    A point is beaten by one that is nowhere larger and somewhere smaller; a point with a NaN is no candidate.
+
+    Parameters
+    ----------
+    points : array (n, m)
+    """
+    array = np.asarray(points, dtype=float)
+    if array.ndim != 2:
+        raise InputError(f"non_dominated: expected points of shape (n, m), got {array.shape}")
+    kept: Array = np.all(~np.isnan(array), axis=1)
+    others = array[kept]
+    for i in np.flatnonzero(kept):
+        kept[i] = not ((others <= array[i]).all(axis=1) & (others < array[i]).any(axis=1)).any()
+    return kept
