@@ -23,7 +23,7 @@ class Known:
 class Forecast:
     """The open loop from one instant on, as a trigger sees it (`Outlook`); computed when asked, kept for the last time.
 
-    Covariances start at `known`, states at `since`, which is later when the forecast was carried along.
+    States start at `since`; covariances always at `known`, the last estimate, so that disturbance cells stay whole.
     """
 
     def __init__(self, mhe: MHE, told: State, since: float, x: Array, p: Array, known: Known):
@@ -53,11 +53,7 @@ class Forecast:
     def at(self, told: State, t: float) -> Forecast:
         """Return the same from `t` on, for an estimator in state `told`."""
         t = max(t, self.since)
-        x, known = self.state(t), self.known
-        if self.kept.get("covariance", (None,))[0] == t:
-            covariance = self.kept["covariance"][1]
-            known = Known(t, x, lambda: covariance)
-        return Forecast(self.mhe, told, t, x, self.p, known)
+        return Forecast(self.mhe, told, t, self.state(t), self.p, self.known)
 
     def _keep(self, name: str, t: float, compute: Callable[[], Array]) -> Array:
         if name not in self.kept or self.kept[name][0] != t:

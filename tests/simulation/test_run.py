@@ -120,11 +120,11 @@ def test_a_run_draws_itself(result):
     from matplotlib import pyplot
 
     axes = result.plot()
-    assert [panel.get_ylabel() for panel in axes] == ["position [m]", "speed [m/s]", "sensor [m]", "gap [s]"]
-    _, grid = pyplot.subplots(2, 2)
+    assert [panel.get_ylabel() for panel in axes] == ["position [m]", "speed [m/s]", "sensor [m]", "level", "gap [s]"]
+    _, grid = pyplot.subplots(5, 1)
     assert list(result.plot(grid)) == list(grid.reshape(-1))
-    with pytest.raises(InputError, match="4 axes are needed"):
-        result.plot(grid[0])
+    with pytest.raises(InputError, match="5 axes are needed"):
+        result.plot(grid[:3])
     pyplot.close("all")
 
 

@@ -46,7 +46,7 @@ def test_between_samples_of_send_on_area_the_deviation_integrates_to_the_area(am
     for a, b in pairwise(times):
         t = np.linspace(a, b, 2001)
         reached = np.trapezoid(np.abs(signal(t) - signal(a)), t)
-        growth = np.abs(signal(b) - signal(a)) * STEP
+        growth = (np.abs(signal(b) - signal(a)) + 7 * STEP) * STEP  # the slope is at most 7
         assert area - 1e-3 * area - 1e-5 <= reached <= area + growth + 1e-3 * area + 1e-5
 
 
