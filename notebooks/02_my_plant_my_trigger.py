@@ -206,7 +206,7 @@ rows, kept = [], {}
 for name, policy in policies.items():
     for seed in range(5):
         run = kept[name] = run_with(policy, seed)
-        friction = float(run.dataset["p_hat"].isel(event=-1).item())
+        friction = float(run.dataset["p_hat"].isel(solve=-1).item())
         rows.append(
             {
                 "policy": name,
