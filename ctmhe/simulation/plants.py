@@ -98,6 +98,7 @@ class OdePlant:
         if model.step is not None:
             raise InputError(f"model {model.name!r} is discrete-time: use MapPlant(model)")
         self.model, self.name = model, model.name
+        self._configuration = (model, rtol, atol, backend)
         self.x, self.u, self.w, self.y, self.p = model.x, model.u, model.w, model.y, model.p
         self._integration: Integration = integration_of(model, rtol, atol, backend)
         self.integrator = f"{self._integration.name}, rtol {rtol:g}, atol {atol:g}"
@@ -181,6 +182,9 @@ class OdePlant:
     def close(self) -> None:
         """Do nothing: the plant holds memory of this process only."""
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return rebuilt, self._configuration  # a plant that was pickled has to be started again
+
     def _on_line(self, t: float, u0: Array, slope: Array, w: Array) -> bool:
         """Whether the running solution has this input and disturbance (to rounding)."""
         if self._line is None:
@@ -255,6 +259,11 @@ class MapPlant:
 
     def close(self) -> None:
         """Do nothing: the plant holds memory of this process only."""
+
+
+def rebuilt(model: Model, rtol: float, atol: float, backend: str | None) -> OdePlant:
+    """Return a plant of this configuration."""
+    return OdePlant(model, rtol=rtol, atol=atol, backend=backend)
 
 
 def as_plant(plant: Plant | Model) -> Plant:

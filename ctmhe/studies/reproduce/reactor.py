@@ -33,11 +33,11 @@ LONGEST = 0.5
 """Longest wait of the event-triggered policies in seconds."""
 
 FAMILIES: dict[str, tuple[Callable[[float], Trigger], tuple[float, float]]] = {
-    "send-on-delta": (SendOnDelta, (0.01, 2.0)),
-    "send-on-slope": (SendOnSlope, (0.01, 2.0)),
-    "send-on-area": (SendOnArea, (1e-4, 0.5)),
-    "innovation": (Innovation, (0.01, 2.0)),
-    "innovation energy": (lambda alpha: InnovationEnergy(alpha, eta=ETA, R=R), (1e-4, 10.0)),
+    "send-on-delta": (SendOnDelta, (0.08, 0.4)),
+    "send-on-slope": (SendOnSlope, (0.1, 0.6)),
+    "send-on-area": (SendOnArea, (2e-3, 0.03)),
+    "innovation": (Innovation, (0.06, 0.3)),
+    "innovation energy": (lambda alpha: InnovationEnergy(alpha, eta=ETA, R=R), (0.05, 5.0)),
     "covariance": (CovarianceBound, (0.05, 5.0)),
 }
 """Event-triggered policies by name: how they are made of a threshold, and where to look for one."""
