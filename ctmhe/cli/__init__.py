@@ -122,7 +122,7 @@ def fmu_build(
 def reproduce(
     case: Annotated[str, typer.Argument(help="Name of a published result, such as thesis-3.4.1-ct; `list` shows all.")],
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the result as JSON.")] = None,
-    seeds: Annotated[int, typer.Option(help="Seeded runs.", min=1)] = 20,
+    seeds: Annotated[int | None, typer.Option(help="Seeded runs; the case's own number if left out.", min=1)] = None,
 ) -> None:
     """Reproduce a published result and print it beside the published numbers."""
     from ctmhe.studies.reproduce import CASES
@@ -131,7 +131,8 @@ def reproduce(
     if case == "list":
         typer.echo("\n".join(CASES))
         return
-    result = run_case(case, seeds=seeds, progress=sys.stderr.isatty())
+    given = {} if seeds is None else {"seeds": seeds}
+    result = run_case(case, **given, progress=sys.stderr.isatty())
     for part in ("published", "ours"):
         typer.echo(f"{part}:")
         typer.echo(textwrap.indent(json.dumps(result[part], indent=2), "  "))
