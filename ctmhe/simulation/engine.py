@@ -121,6 +121,7 @@ class Loop:
         self._check_way_back()
         self.estimator = Follower(self.mhe, self.mhe.init(t=start, x=guess, p=p))
         self.sensor = self.estimator if self.channel.faithful else Follower(self.mhe, self.estimator.state)
+        self.followers = (self.estimator,) if self.channel.faithful else (self.estimator, self.sensor)
         unsent = frozen(np.full(len(self.model.y), np.nan))
         self.now = Progress(start, WatchState(()), unsent, start)
         self.segment = self._segment(self._after(0))
@@ -242,7 +243,7 @@ class Loop:
             self.segment = self._segment(segment.b)  # policies may have named earlier times
         if grid is not None:
             start = self.estimator.state.start[: len(self.model.x)]
-            for follower in {id(f): f for f in (self.estimator, self.sensor)}.values():
+            for follower in self.followers:
                 follower.carry(now.t)
             x_online = start if grid == 0 else self.estimator.forecast.x
             level = max(level, 0.0) if crossed else level
@@ -255,10 +256,8 @@ class Loop:
         """Tell the estimators an input that changed."""
         now = self.now
         if len(self.model.u) and (now.told is None or not np.array_equal(u, now.told)):
-            known = Input(now.t, u[self.u_map])
-            self.estimator.tell(known)
-            if self.sensor is not self.estimator:
-                self.sensor.tell(known)
+            for follower in self.followers:
+                follower.tell(Input(now.t, u[self.u_map]))
             now.told = np.array(u)
 
     def _context(self, t: float, y: Array) -> TriggerContext:

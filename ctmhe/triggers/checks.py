@@ -82,6 +82,13 @@ def largest_excess(excess: Array, counted: np.ndarray) -> float:
     return float(np.max(excess[counted])) if counted.any() else -np.inf
 
 
+def largest_move(y: Array, held: Array, delta: Array) -> float:
+    """Return the largest excess of |y - held| over finite `delta` (n,); +inf where nothing is held (NaN) yet."""
+    moved = np.where(np.isnan(held), np.inf, np.abs(y - held))
+    counted = ~np.isnan(y) & np.isfinite(delta)
+    return largest_excess(moved - np.where(counted, delta, 0.0), counted)
+
+
 def weight_matrix(value: ArrayLike, what: str, *, definite: bool) -> tuple[tuple[float, ...], ...]:
     """Return a symmetric positive (semi)definite matrix as a tuple of rows; a number or vector is its diagonal."""
     try:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ctmhe.triggers.base import Trigger, TriggerContext
-from ctmhe.triggers.checks import largest_excess, positive, spread_over, thresholds, watched
+from ctmhe.triggers.checks import largest_excess, largest_move, positive, spread_over, thresholds, watched
 from ctmhe.types import names_of
 
 
@@ -41,9 +41,7 @@ class SendOnDelta(Trigger):
         """Return the largest excess over the thresholds, in output units."""
         chosen = watched(ctx, self.outputs)
         y, y_last, delta = ctx.y[chosen], ctx.y_last[chosen], spread_over(self.delta, chosen, ctx)
-        moved = np.where(np.isnan(y_last), np.inf, np.abs(y - y_last))
-        counted = ~np.isnan(y) & np.isfinite(delta)
-        return largest_excess(moved - np.where(counted, delta, 0.0), counted)
+        return largest_move(y, y_last, delta)
 
 
 @dataclass(frozen=True, repr=False)
@@ -117,9 +115,7 @@ class SendOnSlope(Trigger):
         if ctx.state is not None:
             times, values, slopes = (row[chosen] for row in ctx.state)
             line = np.where(np.isnan(times), line, values + slopes * (ctx.t - times))
-        moved = np.where(np.isnan(line), np.inf, np.abs(y - line))
-        counted = ~np.isnan(y) & np.isfinite(delta)
-        return largest_excess(moved - np.where(counted, delta, 0.0), counted)
+        return largest_move(y, line, delta)
 
     def update(self, ctx: TriggerContext, fired: bool) -> Any:
         """Keep for every output when it was last sent, the value, and the slope from the one before."""
