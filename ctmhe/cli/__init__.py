@@ -82,8 +82,9 @@ def estimate(
     run.save(out / "run.nc")
     run.to_pandas().to_csv(out / "estimates.csv")
     run.events_to_pandas().to_csv(out / "events.csv")
+    run.solves_to_pandas().to_csv(out / "solves.csv")
     save_plot(run, out / "estimates.png")
-    typer.echo(f"\nwritten: {out / 'run.nc'}, estimates.csv, events.csv, estimates.png")
+    typer.echo(f"\nwritten: {out / 'run.nc'}, estimates.csv, events.csv, solves.csv, estimates.png")
 
 
 @fmu_app.command("info")
