@@ -6,10 +6,8 @@ Okabe and Ito's colours, told apart by colour-blind readers; markers and line st
 from ctmhe.plotting.distributions import plot_gap_histogram, plot_solve_times
 from ctmhe.plotting.runs import plot_gaps, plot_level, plot_output, plot_run, plot_state
 from ctmhe.plotting.studies import plot_error_against_samples, plot_heatmap, plot_paired_differences, plot_pareto
-from ctmhe.plotting.tables import non_dominated
 
 __all__ = [
-    "non_dominated",
     "plot_error_against_samples",
     "plot_gap_histogram",
     "plot_gaps",

@@ -9,7 +9,8 @@ import numpy as np
 
 from ctmhe.errors import InputError
 from ctmhe.plotting.style import SMALL, WIDTH, above_legend, ready, scale, style, title
-from ctmhe.plotting.tables import Columns, columns_of, count, groups, means, non_dominated, number, require
+from ctmhe.plotting.tables import Columns, columns_of, count, groups, means, number, require
+from ctmhe.statistics import non_dominated
 
 
 def plot_error_against_samples(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ctmhe.errors import InputError
+from ctmhe.statistics import interval
 from ctmhe.types import Array
 
 Columns = str | Sequence[str] | None
@@ -61,42 +62,12 @@ def means(table: Any, by: Columns, metrics: Sequence[str], confidence: float = 0
         values = group[list(metrics)].to_numpy(dtype=float)
         values = values[np.isfinite(values).all(axis=1)]
         if len(values):
-            rows.append([interval(values[:, i], confidence) for i in range(len(metrics))])
+            found = [interval(column, confidence) for column in values.T]
+            rows.append([(mean, low, high, len(values)) for mean, _, low, high in found])
     return np.array(rows, dtype=float).reshape(len(rows), len(metrics), 4)
-
-
-def interval(values: Array, confidence: float = 0.95) -> tuple[float, float, float, int]:
-    """Return mean, lower and upper limit of Student's interval of the mean, and the number of values."""
-    from scipy.special import stdtrit
-
-    n = len(values)
-    mean = float(np.mean(values))
-    if n < 2:
-        return mean, np.nan, np.nan, n
-    half = float(stdtrit(n - 1, 0.5 + confidence / 2) * np.std(values, ddof=1) / np.sqrt(n))
-    return mean, mean - half, mean + half, n
 
 
 def count(numbers: Any) -> str:
     """Return how many runs stand behind points: `n = 20` or `n = 18 to 20`."""
     low, high = int(min(numbers)), int(max(numbers))
     return f"n = {low}" if low == high else f"n = {low} to {high}"
-
-
-def non_dominated(points: Any) -> Array:
-    """Return which points no other point beats, (n,) of bool, all columns to be minimised.
-
-    A point is beaten by one that is nowhere larger and somewhere smaller; a point with a NaN is no candidate.
-
-    Parameters
-    ----------
-    points : array (n, m)
-    """
-    array = np.asarray(points, dtype=float)
-    if array.ndim != 2:
-        raise InputError(f"non_dominated: expected points of shape (n, m), got {array.shape}")
-    kept: Array = np.all(~np.isnan(array), axis=1)
-    others = array[kept]
-    for i in np.flatnonzero(kept):
-        kept[i] = not ((others <= array[i]).all(axis=1) & (others < array[i]).any(axis=1)).any()
-    return kept

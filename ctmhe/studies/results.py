@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctmhe.errors import InputError
+from ctmhe.statistics import interval
 from ctmhe.studies.store import Row, Store, finished
-from ctmhe.types import Array
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -236,20 +236,6 @@ def make_table(
         if len(kinds) > 1:  # a column is numbers or text
             table[metric] = table[metric].map(str, na_action="ignore")
     return StudyResult(table, parameters, wanted, name, store)
-
-
-def interval(values: Array, confidence: float) -> tuple[float, float, float, float]:
-    """Return mean, standard deviation and Student's confidence interval (low, high) of the mean."""
-    if not 0 < confidence < 1:
-        raise InputError(f"confidence must lie between 0 and 1, got {confidence!r}")
-    n = len(values)
-    if n < 2:
-        return (float(values.mean()) if n else np.nan), np.nan, np.nan, np.nan
-    from scipy.stats import t
-
-    mean, sd = float(values.mean()), float(values.std(ddof=1))
-    half = float(t.ppf(0.5 + confidence / 2, n - 1)) * sd / np.sqrt(n)
-    return mean, sd, mean - half, mean + half
 
 
 def _groups(table: pd.DataFrame, by: Sequence[str]) -> Iterable[tuple[dict[str, Any], pd.DataFrame]]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctmhe.errors import InputError
+from ctmhe.statistics import non_dominated
 from ctmhe.studies.design import bounds_of
 from ctmhe.studies.study import Study
 from ctmhe.types import names_of
@@ -166,12 +167,7 @@ def pareto_front(table: pd.DataFrame, minimise: Sequence[str], maximise: Sequenc
     if not wanted:
         raise InputError("pareto_front: name a column to minimise or maximise")
     costs = np.column_stack([sign * table[name].to_numpy(dtype=float) for name, sign in wanted])
-    known = ~np.isnan(costs).any(axis=1)
-    front = [
-        i
-        for i in np.flatnonzero(known)
-        if not ((costs[known] <= costs[i]).all(axis=1) & (costs[known] < costs[i]).any(axis=1)).any()
-    ]
+    front = np.flatnonzero(non_dominated(costs))
     return table.iloc[sorted(front, key=lambda i: tuple(costs[i]))]
 
 

@@ -11,7 +11,8 @@ from scipy import stats
 
 from ctmhe import Periodic, Study
 from ctmhe.errors import InputError
-from ctmhe.studies.results import interval, make_table
+from ctmhe.statistics import interval
+from ctmhe.studies.results import make_table
 from tests.studies.cases import Reactor, draw
 
 VALUES = st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=12)
