@@ -5,10 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+import numpy as np
+
 from ctmhe.errors import TooLate
 from ctmhe.estimators.mhe import MHE
 from ctmhe.estimators.state import State
 from ctmhe.types import Array, Estimate, Input, Measurement, Outcome, frozen
+
+SAME = 1e-6
+"""Fraction of a disturbance cell within which times are the same, as in its mesh."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,12 +28,14 @@ class Known:
 class Forecast:
     """The open loop from one instant on, as a trigger sees it (`Outlook`); computed when asked, kept for the last time.
 
-    States start at `since`; covariances always at `known`, the last estimate, so that disturbance cells stay whole.
+    States start at `since`. Covariances start at `known`, the last estimate, and go on from `whole`, the last edge of a
+    disturbance cell that one was asked for behind, so that cells stay whole.
     """
 
-    def __init__(self, mhe: MHE, told: State, since: float, x: Array, p: Array, known: Known):
+    def __init__(self, mhe: MHE, told: State, since: float, x: Array, p: Array, known: Known, whole: Known | None = None):
         self.mhe, self.told = mhe, told
-        self.since, self.x, self.p, self.known = since, x, p, known
+        self.since, self.x, self.p = since, x, p
+        self.known, self.whole = known, known if whole is None else whole
         self.kept: dict[str, tuple[float, Array]] = {}
 
     def state(self, t: float) -> Array:
@@ -45,15 +52,25 @@ class Forecast:
         """Return the covariance predicted for `t`."""
 
         def carried() -> Array:
-            start, known = self.known, self.known.covariance()
-            return self.mhe.propagate_covariance(self.told, start.t, t, start.x, self.p, known)
+            start = self.whole if self.whole.t <= t else self.known
+            edge = min(self.mhe.interval * np.floor(t / self.mhe.interval + SAME), t)
+            edge = t if t - edge < SAME * self.mhe.interval else edge
+            if start.t < edge:
+                x = self.mhe.propagate(self.told, start.t, edge, start.x, self.p)
+                covariance = self._carry(start, edge)
+                start = self.whole = Known(edge, x, lambda: covariance)
+            return self._carry(start, t)
 
         return self._keep("covariance", t, carried)
 
-    def at(self, told: State, t: float) -> Forecast:
-        """Return the same from `t` on, for an estimator in state `told`."""
+    def at(self, told: State, t: float, unchanged: float = np.inf) -> Forecast:
+        """Return the same from `t` on, for an estimator in state `told` whose inputs stay the same up to `unchanged`."""
         t = max(t, self.since)
-        return Forecast(self.mhe, told, t, self.state(t), self.p, self.known)
+        whole = self.whole if self.whole.t <= unchanged else None
+        return Forecast(self.mhe, told, t, self.state(t), self.p, self.known, whole)
+
+    def _carry(self, start: Known, t: float) -> Array:
+        return self.mhe.propagate_covariance(self.told, start.t, t, start.x, self.p, start.covariance())
 
     def _keep(self, name: str, t: float, compute: Callable[[], Array]) -> Array:
         if name not in self.kept or self.kept[name][0] != t:
@@ -74,7 +91,8 @@ class Follower:
     def tell(self, known: Input) -> None:
         """Let it know an input."""
         self.state = self.mhe.control(self.state, known)
-        self.forecast = self.forecast.at(self.state, self.forecast.since)
+        unchanged = -np.inf if self.mhe.assembly.input_linear else known.t
+        self.forecast = self.forecast.at(self.state, self.forecast.since, unchanged)
 
     def observe(self, measurements: Iterable[Measurement]) -> int:
         """Hand over measurements; return how many it took, the others came too late."""

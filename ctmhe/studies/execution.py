@@ -10,8 +10,10 @@ import logging
 import os
 import pickle
 import re
+import sys
 import threading
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
@@ -29,6 +31,10 @@ from ctmhe.studies.trajectories import write_trajectory
 log = logging.getLogger(__name__)
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
+RENEW_AFTER = 100
+"""Runs after which a process of our own that has grown is replaced: compiled libraries leak (scikits.odes half a
+kilobyte with every restart of a solution), and a study is long."""
+
 GIVEN_WIDTH = 1000
 """Tasks that are handed to a cluster at a time, so that a cluster that grows with its queue has reason to."""
 
@@ -215,7 +221,12 @@ def _work(digest: str, content: Any, parameters: tuple[str, ...], task: Task) ->
                 "same packages, and the module of the case"
             ) from error
     case, values = _KNOWN.book
-    return perform(case, dict(zip(parameters, values[task.point], strict=True)), task)
+    outcome = perform(case, dict(zip(parameters, values[task.point], strict=True)), task)
+    _KNOWN.runs = getattr(_KNOWN, "runs", 0) + 1
+    if _KNOWN.runs == RENEW_AFTER and "joblib.externals.loky.process_executor" in sys.modules:
+        # loky replaces a worker, without losing a task, when it has grown by more than this since its first one
+        sys.modules["joblib.externals.loky.process_executor"]._MAX_MEMORY_LEAK_SIZE = 0  # type: ignore[attr-defined]
+    return outcome
 
 
 def _follow(parent: int) -> None:
@@ -262,6 +273,7 @@ class _Processes(_Pool):
             from joblib.externals.loky import get_reusable_executor
         except ImportError:
             raise MissingExtra("joblib", "study", "running a study on several workers") from None
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)  # ours do, see RENEW_AFTER
         self.executor = get_reusable_executor(
             max_workers=self.workers, timeout=60, env=ONE_THREAD, initializer=_follow, initargs=(os.getpid(),)
         )
