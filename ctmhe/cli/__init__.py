@@ -124,6 +124,7 @@ def reproduce(
     case: Annotated[str, typer.Argument(help="Name of a published result, such as thesis-3.4.1-ct; `list` shows all.")],
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the result as JSON.")] = None,
     seeds: Annotated[int | None, typer.Option(help="Seeded runs; the case's own number if left out.", min=1)] = None,
+    workers: Annotated[int, typer.Option(help="Processes.", min=1)] = 1,
 ) -> None:
     """Reproduce a published result and print it beside the published numbers."""
     from ctmhe.studies.reproduce import CASES
@@ -133,7 +134,7 @@ def reproduce(
         typer.echo("\n".join(CASES))
         return
     given = {} if seeds is None else {"seeds": seeds}
-    result = run_case(case, **given, progress=sys.stderr.isatty())
+    result = run_case(case, **given, workers=workers, progress=sys.stderr.isatty())
     for part in ("published", "ours"):
         typer.echo(f"{part}:")
         typer.echo(textwrap.indent(json.dumps(result[part], indent=2), "  "))

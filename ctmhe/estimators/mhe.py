@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
+from math import floor
 from typing import Any
 
 import numpy as np
@@ -564,15 +565,31 @@ class MHE:
         The last known input is held. For a `DiscreteModel` both times are multiples of its step. Where the model cannot
         be evaluated, the state is held.
         """
+        return self.carry(state, t0, t1, x, p)[0] if t1 > t0 else x
+
+    def carry(self, state: State, t0: float, t1: float, x: Array, p: Array) -> tuple[Array, Array]:
+        """Return state (nx,) and undisturbed output (ny,) at `t1` from `x` at `t0`: `propagate` and `output` in one."""
         if t1 <= t0:
-            return x
-        mesh, u0, u1 = self._open_loop(state, t0, t1)
+            return x, self.output(state, t1, x, p)
+        times, rows = self._known_inputs(state, t0, t1)
+        held = not self.assembly.discrete and not (len(times) and times[-1] > t0)  # no switch: most predictions
+        slack = self._slack(t1)
+        edge = (floor((t0 + slack) / self.interval) + 1) * self.interval
+        y = None
         try:
-            for k in range(len(mesh)):
-                x, _ = self.stage.step(mesh.t[k], mesh.h[k], x, self._silent, p, u0[k], u1[k])
+            if held and edge > t0 + slack and edge >= t1 - slack:  # within one cell
+                u = rows[-1] if len(rows) else NOTHING
+                x, ends = self.stage.step(t0, t1 - t0, x, self._silent, p, u, u)
+                y = ends[-1]
+            else:
+                mesh, u0, u1 = self._open_loop(state, t0, t1)
+                for k in range(len(mesh)):
+                    x, ends = self.stage.step(mesh.t[k], mesh.h[k], x, self._silent, p, u0[k], u1[k])
+                    y = ends[-1] if held else None
         except FloatingPointError:
             logger.warning("the prediction from t = %g s to %g s holds the state: the model fails", t0, t1)
-        return x
+            y = None
+        return x, self.output(state, t1, x, p) if y is None else y
 
     def prior_covariance(self, t: float = 0.0) -> Array:
         """Return the covariance (n, n) of (x, estimated p) that the prior's weight P stands for at `t`: its inverse."""
@@ -648,8 +665,8 @@ class MHE:
             raise NotEstimated(
                 f"prediction at t = {t:g} s lies before the last estimate at {state.t:g} s; use smooth(state, t)"
             )
-        x = frozen(self.propagate(state, state.t, t, state.x, state.p))
-        return Prediction(t, x, state.p, frozen(self.output(state, t, x, state.p)))
+        x, y = self.carry(state, state.t, t, state.x, state.p)
+        return made(Prediction, {"t": t, "x": frozen(x), "p": state.p, "y": frozen(y)})
 
     def smooth(self, state: State, t: float) -> Array:
         """Return the state (nx,) at a past time `t` from the last window's solution: all data known then.

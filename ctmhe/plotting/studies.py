@@ -238,7 +238,7 @@ def plot_paired_differences(
         One row a comparison, as `StudyResult.compare` returns; rows are named by the columns `by`.
     axes : Axes, optional
     by : str or sequence of str, optional
-        All columns in front of `difference` when left out.
+        All columns in front of `difference` but the numbers of pairs when left out.
     difference, low, high : str
         Columns: mean difference and its interval.
     xlabel : str
@@ -255,7 +255,8 @@ def plot_paired_differences(
     require(comparison, [difference, low, high, *columns_of(by)], "plot_paired_differences")
     if not len(comparison):
         raise InputError("plot_paired_differences: there is nothing to compare")
-    names = columns_of(by) or [str(c) for c in comparison.columns[: list(comparison.columns).index(difference)]]
+    before = [str(column) for column in comparison.columns[: list(comparison.columns).index(difference)]]
+    names = columns_of(by) or [name for name in before if name not in ("n", "dropped")]
     axes = ready(axes, size=(WIDTH, 1.1 + 0.34 * len(comparison)))
     ticks = _row_names(comparison, names)
     for row, (middle, left, right) in enumerate(comparison[[difference, low, high]].to_numpy(dtype=float)):
@@ -266,6 +267,7 @@ def plot_paired_differences(
     axes.set_yticks(range(len(ticks)), ticks)
     axes.set_ylim(len(ticks) - 0.4, -0.6)
     axes.grid(visible=False, axis="y")
+    axes.locator_params(axis="x", nbins=6)
     axes.set_xlabel(xlabel)
     return axes
 

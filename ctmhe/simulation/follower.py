@@ -36,17 +36,18 @@ class Forecast:
         self.mhe, self.told = mhe, told
         self.since, self.x, self.p = since, x, p
         self.known, self.whole = known, known if whole is None else whole
-        self.kept: dict[str, tuple[float, Array]] = {}
+        self.ahead: tuple[float, tuple[Array, Array]] = (np.nan, (x, x))
+        self.spread: tuple[float, Array] = (np.nan, x)
 
     def state(self, t: float) -> Array:
         """Return the state predicted for `t`."""
         if t <= self.since:
             return self.x
-        return self._keep("state", t, lambda: self.mhe.propagate(self.told, self.since, t, self.x, self.p))
+        return self._both(t)[0]
 
     def output(self, t: float) -> Array:
         """Return the output predicted for `t`."""
-        return self._keep("output", t, lambda: self.mhe.output(self.told, t, self.state(t), self.p))
+        return self._both(t)[1]
 
     def covariance(self, t: float) -> Array:
         """Return the covariance predicted for `t`."""
@@ -61,7 +62,9 @@ class Forecast:
                 start = self.whole = Known(edge, x, lambda: covariance)
             return self._carry(start, t)
 
-        return self._keep("covariance", t, carried)
+        if self.spread[0] != t:
+            self.spread = (t, frozen(carried()))
+        return self.spread[1]
 
     def at(self, told: State, t: float, unchanged: float = np.inf) -> Forecast:
         """Return the same from `t` on, for an estimator in state `told` whose inputs stay the same up to `unchanged`."""
@@ -72,10 +75,11 @@ class Forecast:
     def _carry(self, start: Known, t: float) -> Array:
         return self.mhe.propagate_covariance(self.told, start.t, t, start.x, self.p, start.covariance())
 
-    def _keep(self, name: str, t: float, compute: Callable[[], Array]) -> Array:
-        if name not in self.kept or self.kept[name][0] != t:
-            self.kept[name] = (t, frozen(compute()))
-        return self.kept[name][1]
+    def _both(self, t: float) -> tuple[Array, Array]:
+        if self.ahead[0] != t:
+            x, y = self.mhe.carry(self.told, self.since, t, self.x, self.p)
+            self.ahead = (t, (frozen(x), frozen(y)))
+        return self.ahead[1]
 
 
 class Follower:

@@ -15,8 +15,9 @@ import threading
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -93,7 +94,9 @@ def perform(case: Callable[..., Any], point: dict[str, Any], task: Task) -> Outc
     """Do a run; whatever it raises becomes its error."""
     start = time.perf_counter()
     try:
-        run, values = read_answer(case(seed=task.seed, **point))
+        with _heard_once():
+            answer = case(seed=task.seed, **point)
+        run, values = read_answer(answer)
         if task.trajectory is not None:
             if run is None:
                 raise InputError("the case returned no Run: there is no trajectory to keep")
@@ -103,6 +106,37 @@ def perform(case: Callable[..., Any], point: dict[str, Any], task: Task) -> Outc
     except (Exception, SystemExit) as error:
         log.debug("a run failed", exc_info=True)
         return Outcome({}, f"{type(error).__name__}: {error}", time.perf_counter() - start)
+
+
+class _Once(logging.Filter):
+    """Lets a warning pass once a process, whatever the numbers in it: a thousand runs of a study need not repeat it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.heard: set[str] = set()
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether a message is new."""
+        new = record.levelno > logging.WARNING or record.msg not in self.heard
+        self.heard.add(record.msg)
+        return new
+
+
+_ONCE = _Once()
+_REPEATED = ("ctmhe.simulation.engine", "ctmhe.simulation.loop")
+"""Loggers of what a run says at its end."""
+
+
+@contextmanager
+def _heard_once() -> Iterator[None]:
+    loggers = [logging.getLogger(name) for name in _REPEATED]
+    for logger in loggers:
+        logger.addFilter(_ONCE)
+    try:
+        yield
+    finally:
+        for logger in loggers:
+            logger.removeFilter(_ONCE)
 
 
 def execute(

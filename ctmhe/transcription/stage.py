@@ -228,8 +228,8 @@ class _Scratch:
 
     def one(self, *values) -> tuple[Array, Array]:
         bound = self.bound[0][-1]
-        for array, value in zip(bound.inputs, values, strict=True):
-            array[0] = value
+        for i in bound.live:
+            bound.inputs[i][0] = values[i]
         bound.run()
         x_next, y = bound.outputs
         return x_next[0].copy(), y.reshape(-1, self.stage.ny).copy()
@@ -268,18 +268,19 @@ def _bind(function: ca.Function, size: int) -> _Bound:
             buffer.set_arg(i, memoryview(array))  # pyright: ignore
     for i, array in enumerate(outputs):
         buffer.set_res(i, memoryview(array))  # pyright: ignore
-    return _Bound(size, inputs, outputs, trigger, buffer)
+    return _Bound(size, inputs, outputs, trigger, buffer, [i for i, array in enumerate(inputs) if array.size])
 
 
 @dataclass(frozen=True, eq=False)
 class _Bound:
-    """A mapped function with its memory: write `inputs`, `run`, read `outputs`."""
+    """A mapped function with its memory: write `inputs`, those that are not empty (`live`), `run`, read `outputs`."""
 
     size: int
     inputs: list[Array]
     outputs: list[Array]
     trigger: Callable[[], None]
     buffer: Any
+    live: list[int]
 
     def run(self) -> None:
         try:

@@ -132,13 +132,15 @@ def one_sampling(kind: str, seeds: range, *, progress: bool) -> dict[str, Any]:
     }
 
 
-def reproduce(*, seeds: int = 20, progress: bool = False) -> dict[str, Any]:
+def reproduce(*, seeds: int = 20, workers: int = 1, progress: bool = False) -> dict[str, Any]:
     """Run the case.
 
     Parameters
     ----------
     seeds : int
         Number of seeded runs of each sampling.
+    workers : int
+        Processes; two are of use, one for each sampling.
     progress : bool
         Show a progress bar.
 
@@ -146,7 +148,14 @@ def reproduce(*, seeds: int = 20, progress: bool = False) -> dict[str, Any]:
     -------
     dict with `published`, `ours` (`non_equidistant`, `equidistant`), `settings`, `comment`
     """
-    ours = {kind: one_sampling(kind, range(seeds), progress=progress) for kind in ("non_equidistant", "equidistant")}
+    kinds = ("non_equidistant", "equidistant")
+    if workers == 1:
+        found = [one_sampling(kind, range(seeds), progress=progress) for kind in kinds]
+    else:
+        from joblib import Parallel, delayed
+
+        found = Parallel(workers)(delayed(one_sampling)(kind, range(seeds), progress=progress) for kind in kinds)
+    ours = dict(zip(kinds, found, strict=True))
     return {
         "case": "thesis-3.4.1-ct",
         "published": PUBLISHED,
