@@ -147,7 +147,7 @@ result.means("samples", "online_rms", "settled_rms").round(3)
 compared = {name: result.compare(name, {"policy": "equidistant"}) for name in ("online_rms", "settled_rms")}
 figure, panels = plt.subplots(1, 2, figsize=(9, 2.8), layout="constrained", sharey=True)
 titles = ("whole run", "after the first second")
-for axes, (name, table), title in zip(panels, compared.items(), titles, strict=True):
+for axes, table, title in zip(panels, compared.values(), titles, strict=True):
     plot_paired_differences(table, axes, xlabel="difference of the online RMS error [bar]")
     axes.set_title(title)
 plt.show()
@@ -183,7 +183,8 @@ plt.show()
 
 # %% [markdown]
 # ## Error against samples
-# A budget of fifty is one point of a curve. Each family moves along its own, as the threshold, or the period, is scaled.
+# A budget of fifty is one point of a curve. Each family moves along its own as its threshold,
+# or its period, is scaled.
 
 # %%
 scales = (0.75, 1.0, 1.6) if not LARGE else (0.5, 0.7, 1.0, 1.4, 2.0)

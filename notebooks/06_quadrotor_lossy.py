@@ -13,8 +13,8 @@
 
 # %% [markdown]
 # # A quadrotor over a lossy channel
-# Twelve states, six of them measured, and a radio that loses messages, delays them, rounds values and has a clock of its
-# own. An event-triggered sensor says little, and each message matters: what does a lost one cost, and is a clock, which
+# Twelve states, six of them measured, and a radio that loses messages, delays them, rounds values and has its own clock.
+# An event-triggered sensor says little, and each message matters: what does a lost one cost, and is a clock, which
 # says the same over and over, better off?
 #
 # `CTMHE_SIZE=large` runs more seeds and a finer grid.
@@ -206,8 +206,8 @@ plt.show()
 # %% [markdown]
 # ## A dead link
 # Losses that come in outages of 0.6 s on average. Without messages the estimator goes on in open loop and the error
-# grows; the first message that gets through ends it. An error of open loop is foreseen: the predicted covariance, carried
-# along without measurements, is what `CovarianceBound` samples by.
+# grows; the first message that gets through ends it. An error of open loop is foreseen: the predicted covariance,
+# carried along without measurements, is what `CovarianceBound` samples by.
 
 # %%
 dead = fly(seed=3, policy=event, loss=0.4, outage=0.6)
@@ -221,7 +221,10 @@ known = mhe.prior_covariance()
 times = np.arange(0.0, 1.01, 0.25)
 carried = [mhe.propagate_covariance(mhe.control(state, Input(0.0, rotors(0.0))), 0.0, t, state.x, state.p, known)
            for t in times]  # fmt: skip
-print("deviation of z1 after", ", ".join(f"{t:g} s: {np.sqrt(P[0, 0]):.2f} m" for t, P in zip(times, carried, strict=True)))
+print(
+    "deviation of z1 after",
+    ", ".join(f"{t:g} s: {np.sqrt(P[0, 0]):.2f} m" for t, P in zip(times, carried, strict=True)),
+)
 
 figure, axes = plt.subplots(figsize=(8, 3), layout="constrained")
 error = np.linalg.norm(dead.online_error().sel(state=["z1", "z2", "z3"]), axis=1)

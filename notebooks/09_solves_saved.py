@@ -89,8 +89,8 @@ def run_with(*, seed, family, setting, policy):
 
 # %% [markdown]
 # ## The curve
-# The noise of the output is 0.1 bar at most, so thresholds below it fire on noise. The rivals know nothing: a clock that
-# solves at equal intervals, and a schedule that is dense at first.
+# The noise of the output is 0.1 bar at most, so thresholds below it fire on noise. The rivals know nothing: a clock
+# that solves at equal intervals, and a schedule that is dense at first.
 
 # %%
 thresholds = (0.08, 0.1, 0.11, 0.13, 0.16, 0.2) if LARGE else (0.09, 0.11, 0.14)
@@ -100,9 +100,7 @@ points = [everything]
 points += [
     {"family": "innovation", "setting": level, "policy": Innovation(level) | MaxInterval(0.5)} for level in thresholds
 ]
-points += [
-    {"family": "periodic", "setting": period, "policy": Periodic(period, start=period)} for period in periods
-]
+points += [{"family": "periodic", "setting": period, "policy": Periodic(period, start=period)} for period in periods]
 points += [{"family": "dense first", "setting": 50, "policy": LinearGaps(0.01, 0.19, 50)}]
 result = Study(run_with, points, SEEDS).run(workers=os.cpu_count() if LARGE else 1)
 
@@ -113,7 +111,6 @@ means["solve time saved %"] = 100 * (1 - means["solve_seconds_total"] / base["so
 for name in ("online_rms", "settled_rms"):
     means[f"{name} ratio"] = means[name] / base[name]
 means.drop(columns=["solve_seconds_total"]).round(3)
-
 
 
 # %%
@@ -137,9 +134,7 @@ plt.show()
 # is left after the first second tells whether the later solves are well placed:
 
 # %%
-axes = plot_error_against_samples(
-    result.table, error="settled_rms", samples="solves", by="family", parameter="setting"
-)
+axes = plot_error_against_samples(result.table, error="settled_rms", samples="solves", by="family", parameter="setting")
 on_a_logarithmic_scale(axes)
 plt.show()
 

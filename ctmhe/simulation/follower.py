@@ -32,7 +32,9 @@ class Forecast:
     disturbance cell that one was asked for behind, so that cells stay whole.
     """
 
-    def __init__(self, mhe: MHE, told: State, since: float, x: Array, p: Array, known: Known, whole: Known | None = None):
+    def __init__(
+        self, mhe: MHE, told: State, since: float, x: Array, p: Array, known: Known, whole: Known | None = None
+    ):
         self.mhe, self.told = mhe, told
         self.since, self.x, self.p = since, x, p
         self.known, self.whole = known, known if whole is None else whole
@@ -67,7 +69,7 @@ class Forecast:
         return self.spread[1]
 
     def at(self, told: State, t: float, unchanged: float = np.inf) -> Forecast:
-        """Return the same from `t` on, for an estimator in state `told` whose inputs stay the same up to `unchanged`."""
+        """Return the same from `t` on, for an estimator in state `told`; inputs are the same up to `unchanged`."""
         t = max(t, self.since)
         whole = self.whole if self.whole.t <= unchanged else None
         return Forecast(self.mhe, told, t, self.state(t), self.p, self.known, whole)
