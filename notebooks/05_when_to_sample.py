@@ -187,7 +187,7 @@ plt.show()
 # or its period, is scaled.
 
 # %%
-scales = (0.75, 1.0, 1.6) if not LARGE else (0.5, 0.7, 1.0, 1.4, 2.0)
+scales = (1.0, 1.6) if not LARGE else (0.5, 0.7, 1.0, 1.4, 2.0)
 points = [
     {"family": family, "scale": scale, "policy": made(family, thresholds[family] * scale)}
     for family in families
