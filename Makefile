@@ -31,6 +31,7 @@ bench: .venv/.ready-test  ## time ctmhe and its peers; rows in results/benchmark
 	$(bin)/python -m benchmarks.stiff
 	$(bin)/python -m benchmarks.limits --json results/limits.json
 	$(bin)/python -m benchmarks.fmus --json results/fmus.json
+	$(bin)/python -m benchmarks.studies --json results/studies.json
 
 clean:  ## remove what tests, linters and the demo leave behind
 	rm -rf demo build dist .pytest_cache .ruff_cache .hypothesis .import_linter_cache fmus/_build

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import sys
 from pathlib import Path
@@ -40,3 +41,17 @@ def test_relative_links_of_a_page_lead_to_files(page):
     targets = [target for target in LINK.findall(page.read_text("utf-8")) if "://" not in target]
     missing = [target for target in targets if not (page.parent / target).exists()]
     assert not missing
+
+
+RESULTS = {"Predicate", "Watch", "WatchState", "TriggerContext", "Outlook", "ExcitationMeasure", "Or", "And", "Trigger",
+           "Design", "Exploration", "Status", "StudyResult", "Threshold"}  # fmt: skip
+"""What these rooms hand out, not what a user writes."""
+
+
+@pytest.mark.parametrize("room", ["ctmhe.triggers", "ctmhe.studies", "ctmhe.plotting", "ctmhe.models.library"])
+def test_each_public_name_is_in_an_executed_example(room):
+    """A name that no page and no notebook shows is not documented."""
+    shown = [block for page in PAGES for block in BLOCK.findall(page.read_text("utf-8"))]
+    shown += [path.read_text("utf-8") for path in (ROOT / "notebooks").glob("*.py")]
+    words = set(re.findall(r"\w+", "\n".join(shown)))
+    assert not set(importlib.import_module(room).__all__) - RESULTS - words
