@@ -14,8 +14,8 @@
 # %% [markdown]
 # # A quadrotor over a lossy channel
 # Twelve states, six of them measured, and a radio that loses messages, delays them, rounds values and has its own
-# clock. An event-triggered sensor says little, and each message matters: what does a lost one cost, and is a clock, which
-# says the same over and over, better off?
+# clock. An event-triggered sensor says little, and each message matters: what does a lost one cost, and is a clock,
+# which says the same over and over, better off?
 #
 # `CTMHE_SIZE=large` runs more seeds and a finer grid.
 

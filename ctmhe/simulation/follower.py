@@ -10,10 +10,8 @@ import numpy as np
 from ctmhe.errors import TooLate
 from ctmhe.estimators.mhe import MHE
 from ctmhe.estimators.state import State
+from ctmhe.transcription.grid import same_time
 from ctmhe.types import Array, Estimate, Input, Measurement, Outcome, frozen
-
-SAME = 1e-6
-"""Fraction of a disturbance cell within which times are the same, as in its mesh."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +54,9 @@ class Forecast:
 
         def carried() -> Array:
             start = self.whole if self.whole.t <= t else self.known
-            edge = min(self.mhe.interval * np.floor(t / self.mhe.interval + SAME), t)
-            edge = t if t - edge < SAME * self.mhe.interval else edge
+            interval, slack = self.mhe.interval, same_time(self.mhe.interval, t)
+            edge = min(interval * np.floor((t + slack) / interval), t)
+            edge = t if t - edge <= slack else edge
             if start.t < edge:
                 x = self.mhe.propagate(self.told, start.t, edge, start.x, self.p)
                 covariance = self._carry(start, edge)

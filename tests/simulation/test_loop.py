@@ -20,6 +20,7 @@ from ctmhe.simulation import (
     WholeSignal,
     simulate,
 )
+from ctmhe.simulation.follower import Follower
 from ctmhe.transcription.integrators import RK4
 from ctmhe.triggers import (
     Innovation,
@@ -381,3 +382,21 @@ def test_casadi_operations_on_plants_match_numpy():
     plant.start(0.0, np.array([1.0, 0.0]))
     plant.advance(0.5, np.zeros(0), np.zeros(0), np.array([0.25]))
     assert plant.output(np.zeros(0), np.array([0.25]))[0] == pytest.approx(np.sin(np.cos(0.5)) + 0.25, abs=1e-9)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.floats(0.01, 0.97), min_size=1, max_size=8), st.floats(0.0, 0.3))
+def test_a_predicted_covariance_does_not_depend_on_what_was_asked_before(times, since):
+    """Carried on from cell to cell, or from the last estimate at once: the same, and so are state and output."""
+    mhe = MHE(DECAY, horizon=1.0, interval=0.1, integrator=RK4(step=0.05), cost=COST, hold="point")
+    start = mhe.init(t=since, x=[0.7])
+    asked = Follower(mhe, start).forecast
+    for t in [since + time for time in times]:
+        at_once = Follower(mhe, start).forecast
+        assert asked.covariance(t) == pytest.approx(at_once.covariance(t), rel=1e-7)  # edges within 1e-9 are one
+        assert (asked.state(t) == at_once.state(t)).all()
+        assert asked.output(t) == pytest.approx(mhe.output(start, t, asked.state(t), start.p), rel=1e-14)
+    for t in np.arange(since, since + 1.0, 0.05):  # and along a run, step by step
+        asked = asked.at(start, t)
+        at_once = Follower(mhe, start).forecast
+        assert asked.covariance(t) == pytest.approx(at_once.covariance(t), rel=1e-7)  # edges within 1e-9 are one

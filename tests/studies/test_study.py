@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
@@ -185,3 +186,17 @@ def test_a_partial_fixes_what_is_no_parameter():
     a, b = (Study(partial(draw, gain=gain), seeds=2).run() for gain in (1.0, 2.0))
     assert set(a.table["key"]).isdisjoint(b.table["key"])
     assert "Study 'draw'" in repr(Study(partial(draw, gain=1.0)))
+
+
+def test_a_study_repeats_no_warning_of_its_runs(caplog):
+    """What a thousand runs have to say is said once; outside of a study every run says it."""
+    logger = logging.getLogger("ctmhe.simulation.engine")
+
+    def case(*, seed):
+        logger.warning("something for %s s in the run of seed %d", 0.1 * seed, seed)
+        return {"value": seed}
+
+    Study(case, {}, seeds=5).run()
+    assert len([record for record in caplog.records if "something for" in record.message]) == 1
+    case(seed=7)
+    assert "seed 7" in caplog.text
