@@ -202,7 +202,7 @@ def moved(*, seed, family, scale, policy):
     return run_with(seed=seed, policy=policy)
 
 
-curve = Study(moved, points, 2 if not LARGE else 30).run(workers=WORKERS)
+curve = Study(moved, points, 3 if not LARGE else 30).run(workers=WORKERS)
 plot_error_against_samples(curve.table, error="settled_rms", by="family", parameter="scale")
 plt.show()
 

@@ -18,5 +18,5 @@ shopt -s nullglob
 notebooks=(notebooks/*.ipynb)
 if [ ${#notebooks[@]} -gt 0 ]; then
   # warnings inside Jupyter's machinery are not ours to mend
-  group "${pytest[@]}" --nbmake --nbmake-timeout=600 -W default "${notebooks[@]}"
+  group "${pytest[@]}" -n 2 --nbmake --nbmake-timeout=600 -W default "${notebooks[@]}"
 fi

@@ -13,7 +13,7 @@ from ctmhe.studies.tuning import find_threshold
 from ctmhe.triggers import Budget, GeometricGaps, LinearGaps, Periodic, Poisson, Trigger
 
 SAMPLES = 50
-TUNED_ON = range(10_000, 10_008)
+TUNED_ON = range(10_000, 10_012)
 """Seeds on which thresholds are found; others compare the policies."""
 
 BASELINE = "equidistant"
