@@ -170,5 +170,6 @@ def make_panels(count: int) -> Any:
         panels[i].tick_params(labelbottom=True)
     for axes in panels[:count]:
         ready(axes)
-    figure.align_ylabels()
+    for column in grid.T:
+        figure.align_ylabels(column)
     return panels[:count]

@@ -83,9 +83,7 @@ class StudyResult:
             of the design. The interval is NaN for a single run.
         """
         self._check_metric(metric)
-        by = self.parameters if by is None else (by,) if isinstance(by, str) else tuple(by)
-        for name in by:
-            _check(name, self.parameters, "parameter")
+        by = self._columns(by)
         rows = []
         for labels, group in _groups(self.table, by):
             values = group[metric].to_numpy(dtype=float)
@@ -114,6 +112,7 @@ class StudyResult:
         metric: str,
         baseline: Any,
         *,
+        by: str | Sequence[str] | None = None,
         confidence: float = 0.95,
         higher_is_better: bool = False,
     ) -> pd.DataFrame:
@@ -124,6 +123,9 @@ class StudyResult:
         metric : str
         baseline : mapping parameter -> label, or a label
             What to compare with, such as `{"policy": "even"}`; a label alone where one parameter only has it.
+        by : str or sequence of str, optional
+            Parameters that make a row, all when left out: with `by="policy"` the pairs of all other parameters count
+            together.
         confidence : float
             Of the interval for the mean difference, after Student's t.
         higher_is_better : bool
@@ -131,7 +133,7 @@ class StudyResult:
         Returns
         -------
         DataFrame
-            One row a point that is not the baseline: the parameters, `n` (pairs), `dropped` (pairs of which a run has
+            One row a point that is not the baseline: `by`, `n` (pairs), `dropped` (pairs of which a run has
             no value), `difference` (mean of point minus baseline), `low`, `high`, `ratio` (mean over baseline mean),
             `better` (share of pairs in which the point is better).
         """
@@ -144,7 +146,7 @@ class StudyResult:
         keys = list(at)
         base = {keys[i]: values[i] for i in np.flatnonzero(is_base)}
         rows = []
-        for labels, group in _groups(self.table.loc[~is_base], self.parameters):
+        for labels, group in _groups(self.table.loc[~is_base], self._columns(by)):
             mine = values[group.index]
             other = np.array([base.get(keys[i], np.nan) for i in group.index])
             both = ~(np.isnan(mine) | np.isnan(other))
@@ -187,6 +189,13 @@ class StudyResult:
         rows.append(f"  parameters: {', '.join(self.parameters) or 'none'}")
         rows.append(f"  metrics: {', '.join(self.metrics) or 'none'}")
         return "\n".join(rows)
+
+    def _columns(self, by: str | Sequence[str] | None) -> tuple[str, ...]:
+        """Return the parameters that make a row, all of them for None."""
+        by = self.parameters if by is None else (by,) if isinstance(by, str) else tuple(by)
+        for name in by:
+            _check(name, self.parameters, "parameter")
+        return by
 
     def _check_metric(self, metric: str) -> None:
         _check(metric, self.metrics, "metric")

@@ -126,3 +126,16 @@ def test_metrics_of_a_run_are_the_runs_own_numbers():
     mixed = Study(lambda *, seed: {"v": "text" if seed else 1.5}, seeds=2).run()
     assert mixed.table["v"].tolist() == ["1.5", "text"]
     assert isinstance(mixed.table, pd.DataFrame) and "2 runs" in repr(mixed)
+
+
+def test_differences_pool_the_pairs_of_all_other_parameters():
+    """by="policy": every load and seed is a pair, each with the baseline's run at the same load and seed."""
+    result = result_of(
+        {("even", 1): [1.0, 2.0], ("odd", 1): [1.5, 2.1], ("even", 2): [5.0, 7.0], ("odd", 2): [5.2, None]}
+    )
+    (row,) = result.compare("error_rms", {"policy": "even"}, by="policy").to_dict("records")
+    mean, _, low, high = interval(np.array([0.5, 0.1, 0.2]))
+    assert (row["policy"], row["n"], row["dropped"]) == ("odd", 3, 1)
+    np.testing.assert_allclose([row["difference"], row["low"], row["high"]], [mean, low, high])
+    with pytest.raises(InputError, match="unknown parameter 'polcy'"):
+        result.compare("error_rms", {"policy": "even"}, by="polcy")
