@@ -157,12 +157,14 @@ def test_the_reactor_budget_in_small(monkeypatch):
     assert ours["failed_runs"] == 0
     assert ours["policies"]["innovation, hard budget"]["samples"]["mean"] <= 50
     assert ours["policies"]["dense first, linear gaps"]["samples"]["mean"] == 50
-    for name, about in ours["policies"].items():
-        difference = about["online_rms"]["mean"] - ours["policies"]["equidistant"]["online_rms"]["mean"]
-        if name != "equidistant":
-            assert about["online_rms_against_equidistant"]["difference"] == pytest.approx(difference)
-            assert about["online_rms_against_equidistant"]["pairs"] == 2
-    assert "dense first, linear gaps" in ours["better_than_equidistant"]["online_rms"]
+    assert ours["policies"]["equidistant, first at once"]["samples"]["mean"] == 50
+    for base in ("equidistant", "equidistant, first at once"):
+        for name, about in ours["policies"].items():
+            difference = about["online_rms"]["mean"] - ours["policies"][base]["online_rms"]["mean"]
+            if name != base:
+                assert about[f"online_rms_against_{base}"]["difference"] == pytest.approx(difference)
+                assert about[f"online_rms_against_{base}"]["pairs"] == 2
+    assert "equidistant, first at once" in ours["better_than"]["equidistant"]["online_rms"]
 
 
 def test_solves_saved_in_small(monkeypatch):
