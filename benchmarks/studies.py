@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from ctmhe.studies.metrics import TIMINGS
 from ctmhe.studies.reproduce.reactor import run_reactor
 from ctmhe.studies.results import StudyResult
 from ctmhe.studies.study import Study
@@ -79,8 +80,7 @@ def killed(runs: int, folder: Path, kills: int, seconds: float) -> tuple[int, St
 def differences(one: StudyResult, other: StudyResult) -> list[str]:
     """Return the columns that differ, bit for bit, those of times left out."""
     left, right = one.table, other.table
-    timings = {"seconds", *(name for name in left.columns if name.startswith("solve_") and name != "solves")}
-    return [name for name in left.columns if name not in timings and not left[name].equals(right[name])]
+    return [name for name in left.columns if name not in TIMINGS and not left[name].equals(right[name])]
 
 
 def main() -> None:

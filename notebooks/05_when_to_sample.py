@@ -95,8 +95,7 @@ def run_with(*, seed, policy):
         monitor=0.01,
         seed=seed,
     )
-    error = run.online_error().to_numpy()[run.t >= 1.0]
-    return run, {"settled_rms": float(np.sqrt(np.mean(np.sum(error**2, axis=1))))}
+    return run, {"settled_rms": run.online_rms(since=1.0)}
 
 
 # %% [markdown]

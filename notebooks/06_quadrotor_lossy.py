@@ -105,8 +105,7 @@ def fly(*, seed, policy, **network):
 
 
 def position_rms(run):
-    error = run.online_error().sel(state=["z1", "z2", "z3"]).to_numpy()
-    return {"position_rms": float(np.sqrt(np.mean(np.sum(error**2, axis=1))))}
+    return run.online_rms(["z1", "z2", "z3"])  # m
 
 
 # %% [markdown]
@@ -131,11 +130,11 @@ print(f"{'':24} samples  lost  bytes  solves  at the sensor  too late  position 
 for name, run in runs.items():
     print(
         f"{name:24} {run.samples:7} {run.messages_lost:5} {run.bytes_sent:6} {run.solves:7} {run.sensor_solves:14} "
-        f"{run.too_late:9}  {position_rms(run)['position_rms']:.4f}"
+        f"{run.too_late:9}  {position_rms(run):.4f}"
     )
 lossy = runs["a third lost"]
 assert lossy.solves == lossy.messages - lossy.messages_lost
-assert position_rms(runs["faithful"])["position_rms"] < position_rms(lossy)["position_rms"]
+assert position_rms(runs["faithful"]) < position_rms(lossy)
 
 # %% [markdown]
 # Every sample of a lossy run is drawn, also those that never arrived: the estimate jumps only where one did.
@@ -166,7 +165,7 @@ losses = (0.0, 0.1, 0.2, 0.3, 0.5) if LARGE else (0.0, 0.4)
 
 def lossy_flight(*, seed, policy, loss):
     run = fly(seed=seed, policy=policy, loss=loss)
-    return run, position_rms(run)
+    return run, {"position_rms": position_rms(run)}
 
 
 study = Study(lossy_flight, {"policy": policies, "loss": losses}, SEEDS)
@@ -196,7 +195,7 @@ delays = (0.0, 0.05, 0.1, 0.2) if LARGE else (0.0, 0.1)
 
 def late_flight(*, seed, loss, delay):
     run = fly(seed=seed, policy=event, loss=loss, delay=delay)
-    return run, position_rms(run)
+    return run, {"position_rms": position_rms(run)}
 
 
 both = Study(late_flight, {"loss": losses, "delay": delays}, SEEDS // 2).run(workers=WORKERS)

@@ -83,8 +83,7 @@ def run_with(*, seed, family, setting, policy):
         monitor=STEP,
         seed=seed,
     )
-    error = run.online_error().to_numpy()[run.t >= 1.0]
-    return run, {"settled_rms": float(np.sqrt(np.mean(np.sum(error**2, axis=1))))}
+    return run, {"settled_rms": run.online_rms(since=1.0)}
 
 
 # %% [markdown]

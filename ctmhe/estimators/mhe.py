@@ -568,28 +568,53 @@ class MHE:
         return self.carry(state, t0, t1, x, p)[0] if t1 > t0 else x
 
     def carry(self, state: State, t0: float, t1: float, x: Array, p: Array) -> tuple[Array, Array]:
-        """Return state (nx,) and undisturbed output (ny,) at `t1` from `x` at `t0`: `propagate` and `output` in one."""
+        """Return state and output at `t1` along the open loop from `x` at `t0`: `propagate` and `output` in one.
+
+        A slot of the transcription ends with the output there, so that a prediction within a disturbance cell, what a
+        trigger asks for at every monitoring time, takes one evaluation.
+
+        Parameters
+        ----------
+        state : State
+            Whose inputs are known; the last one is held.
+        t0, t1 : float
+            Seconds; multiples of the step for a `DiscreteModel`.
+        x : array (nx,)
+            At `t0`, in the units of the model.
+        p : array (np,)
+
+        Returns
+        -------
+        x : array (nx,)
+            At `t1`, without disturbance; held from where the model cannot be evaluated.
+        y : array (ny,)
+            Undisturbed output at `t1`; NaN where the model cannot be evaluated.
+
+        Raises
+        ------
+        InputError
+            When no input is known at `t0`.
+        """
         if t1 <= t0:
             return x, self.output(state, t1, x, p)
         times, rows = self._known_inputs(state, t0, t1)
-        held = not self.assembly.discrete and not (len(times) and times[-1] > t0)  # no switch: most predictions
+        constant = self._is_constant(times, t0)
         slack = self._slack(t1)
         edge = (floor((t0 + slack) / self.interval) + 1) * self.interval
-        y = None
+        ends = NOTHING
         try:
-            if held and edge > t0 + slack and edge >= t1 - slack:  # within one cell
+            if constant and edge > t0 + slack and edge >= t1 - slack:  # within one cell
                 u = rows[-1] if len(rows) else NOTHING
                 x, ends = self.stage.step(t0, t1 - t0, x, self._silent, p, u, u)
-                y = ends[-1]
             else:
-                mesh, u0, u1 = self._open_loop(state, t0, t1)
+                mesh, u0, u1 = self._open_loop(t0, t1, times, rows)
                 for k in range(len(mesh)):
                     x, ends = self.stage.step(mesh.t[k], mesh.h[k], x, self._silent, p, u0[k], u1[k])
-                    y = ends[-1] if held else None
+            if constant:
+                return x, ends[-1]
         except FloatingPointError:
             logger.warning("the prediction from t = %g s to %g s holds the state: the model fails", t0, t1)
-            y = None
-        return x, self.output(state, t1, x, p) if y is None else y
+        return x, self.output(state, t1, x, p)
 
     def prior_covariance(self, t: float = 0.0) -> Array:
         """Return the covariance (n, n) of (x, estimated p) that the prior's weight P stands for at `t`: its inverse."""
@@ -615,18 +640,21 @@ class MHE:
         """
         if t1 <= t0:
             return covariance
-        drive = self._open_loop(state, t0, t1)
+        drive = self._open_loop(t0, t1, *self._known_inputs(state, t0, t1))
         try:
             return frozen(carried_covariance(self.stage, self.assembly, *drive, x, p, covariance))
         except FloatingPointError:
             logger.warning("the covariance from t = %g s to %g s is infinite: the model fails", t0, t1)
             return frozen(np.diag(np.full(len(covariance), np.inf)))
 
-    def _open_loop(self, state: State, t0: float, t1: float) -> tuple[Mesh, Array, Array]:
-        """Return the mesh of a prediction and the inputs at both ends of its slots."""
-        times, rows = self._known_inputs(state, t0, t1)
-        if not self.assembly.discrete and not (len(times) and times[-1] > t0):
-            mesh = plain_mesh(t0, t1, self.interval)  # no switch on the way: most predictions
+    def _is_constant(self, times: Array, t0: float) -> bool:
+        """Whether no input known at `times` switches on the way from `t0` on: most predictions in continuous time."""
+        return not self.assembly.discrete and not (len(times) and times[-1] > t0)
+
+    def _open_loop(self, t0: float, t1: float, times: Array, rows: Array) -> tuple[Mesh, Array, Array]:
+        """Return the mesh of a prediction and the inputs, known at `times`, at both ends of its slots."""
+        if self._is_constant(times, t0):
+            mesh = plain_mesh(t0, t1, self.interval)
         else:
             mesh = self.assembly.mesh(t0, t1, Records(NOTHING, self._unmeasured, times, rows), growing=False)
         if not len(self.model.u):

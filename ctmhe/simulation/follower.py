@@ -51,20 +51,8 @@ class Forecast:
 
     def covariance(self, t: float) -> Array:
         """Return the covariance predicted for `t`."""
-
-        def carried() -> Array:
-            start = self.whole if self.whole.t <= t else self.known
-            interval, slack = self.mhe.interval, same_time(self.mhe.interval, t)
-            edge = min(interval * np.floor((t + slack) / interval), t)
-            edge = t if t - edge <= slack else edge
-            if start.t < edge:
-                x = self.mhe.propagate(self.told, start.t, edge, start.x, self.p)
-                covariance = self._carry(start, edge)
-                start = self.whole = Known(edge, x, lambda: covariance)
-            return self._carry(start, t)
-
         if self.spread[0] != t:
-            self.spread = (t, frozen(carried()))
+            self.spread = (t, frozen(self._spread(t)))
         return self.spread[1]
 
     def at(self, told: State, t: float, unchanged: float = np.inf) -> Forecast:
@@ -73,7 +61,18 @@ class Forecast:
         whole = self.whole if self.whole.t <= unchanged else None
         return Forecast(self.mhe, told, t, self.state(t), self.p, self.known, whole)
 
-    def _carry(self, start: Known, t: float) -> Array:
+    def _spread(self, t: float) -> Array:
+        start = self.whole if self.whole.t <= t else self.known
+        interval, slack = self.mhe.interval, same_time(self.mhe.interval, t)
+        edge = interval * np.floor((t + slack) / interval)
+        edge = t if t - edge <= slack else edge
+        if start.t < edge:  # come to stay at the edge of a cell
+            x = self.mhe.propagate(self.told, start.t, edge, start.x, self.p)
+            covariance = self._carried(start, edge)
+            start = self.whole = Known(edge, x, lambda: covariance)
+        return self._carried(start, t)
+
+    def _carried(self, start: Known, t: float) -> Array:
         return self.mhe.propagate_covariance(self.told, start.t, t, start.x, self.p, start.covariance())
 
     def _both(self, t: float) -> tuple[Array, Array]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
@@ -11,7 +11,7 @@ from uuid import uuid4
 import numpy as np
 
 from ctmhe.errors import InputError
-from ctmhe.types import Array
+from ctmhe.types import Array, names_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -115,24 +115,28 @@ class Run:
         """Return the error of the estimated trajectory (3.16) on the monitoring times, by state."""
         return self._error("x_retro")
 
-    def online_rms(self, state: str | None = None) -> float:
+    def online_rms(self, state: str | Sequence[str] | None = None, *, since: float = -np.inf) -> float:
         """Return the root of the mean squared online error over the monitoring times.
 
         Parameters
         ----------
-        state : str, optional
-            One state's error in its unit; the Euclidean norm over all states (numbers in their units) when left out.
+        state : str or sequence of str, optional
+            One state's error in its unit; the Euclidean norm over several, or all when left out (numbers in their
+            units).
+        since : float
+            Seconds; monitoring times before it are left out, such as those in which a wrong guess is corrected.
 
         Raises
         ------
         InputError
-            When the true state is not known, as in a replayed log.
+            When the true state is not known, as in a replayed log; for an unknown state; when the run ends before
+            `since`.
         """
-        return self._rms("x_online", state)
+        return self._rms("x_online", state, since)
 
-    def retrospective_rms(self, state: str | None = None) -> float:
+    def retrospective_rms(self, state: str | Sequence[str] | None = None, *, since: float = -np.inf) -> float:
         """Return the same for the estimated trajectory (3.16), which uses data up to the next sample."""
-        return self._rms("x_retro", state)
+        return self._rms("x_retro", state, since)
 
     @property
     def ise(self) -> float:
@@ -246,13 +250,20 @@ class Run:
             raise InputError(f"run: the true value of {names} is not known (a replayed log, or another model's state)")
         return self.dataset[variable] - truth
 
-    def _rms(self, variable: str, state: str | None) -> float:
-        if state is None:
-            return float(np.sqrt(np.mean(np.sum(self._error(variable).to_numpy() ** 2, axis=1))))
+    def _rms(self, variable: str, state: str | Sequence[str] | None, since: float) -> float:
+        error = self._error(variable) if state is None else self._error_of(variable, names_of(state))
+        late = self.t >= since
+        if not late.any():
+            raise InputError(f"run: no monitoring time at or after since = {since!r} s; the last is {self.t[-1]:g} s")
+        return float(np.sqrt(np.mean(np.sum(error.to_numpy()[late] ** 2, axis=1))))
+
+    def _error_of(self, variable: str, states: tuple[str, ...]) -> xr.DataArray:
         names = [str(name) for name in self.dataset["state"].to_numpy()]
-        if state not in names:
-            raise InputError(f"unknown state {state!r}. Known: {', '.join(names)}")
-        error = (self.dataset[variable] - self.dataset["x_true"]).to_numpy()[:, names.index(state)]
-        if np.isnan(error).any():
-            raise InputError(f"run: the true value of {state} is not known")
-        return float(np.sqrt(np.mean(error**2)))
+        for state in states or ("",):
+            if state not in names:
+                raise InputError(f"unknown state {state!r}. Known: {', '.join(names)}")
+        error = (self.dataset[variable] - self.dataset["x_true"]).sel(state=list(states))
+        unknown = [state for state in states if np.isnan(error.sel(state=state)).any()]
+        if unknown:
+            raise InputError(f"run: the true value of {', '.join(unknown)} is not known")
+        return error

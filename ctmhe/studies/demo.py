@@ -83,7 +83,7 @@ def report(demonstration: Demonstration) -> str:
             *(f"{run.gaps[1:].min():.3f} / {run.gaps.max():.3f}" for run in (event, periodic)),
         ),
         ("online RMS error [bar]", f"{event.online_rms():.4f}", f"{periodic.online_rms():.4f}"),
-        ("  of it after 1 s", f"{settled_rms(event):.4f}", f"{settled_rms(periodic):.4f}"),
+        ("  of it after 1 s", f"{event.online_rms(since=1.0):.4f}", f"{periodic.online_rms(since=1.0):.4f}"),
         ("retrospective RMS error [bar]", f"{event.retrospective_rms():.4f}", f"{periodic.retrospective_rms():.4f}"),
         ("median solve [ms]", *(f"{1e3 * median(run):.1f}" for run in (event, periodic))),
     ]
@@ -91,12 +91,6 @@ def report(demonstration: Demonstration) -> str:
     lines = [f"{a:<{widths[0]}}  {b:>{widths[1]}}  {c:>{widths[2]}}" for a, b, c in rows]
     lines.insert(1, "-" * len(lines[0]))
     return "\n".join(lines)
-
-
-def settled_rms(run: Run) -> float:
-    """Return the online RMS error after the first second, when the wrong guess is forgotten."""
-    error = run.online_error().values[run.t >= 1.0]
-    return float((error**2).sum(axis=1).mean() ** 0.5)
 
 
 def median(run: Run) -> float:

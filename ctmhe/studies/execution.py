@@ -15,9 +15,8 @@ import threading
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
-from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -90,13 +89,29 @@ class Book:
         return cls(sha256(content).hexdigest(), content)
 
 
-def perform(case: Callable[..., Any], point: dict[str, Any], task: Task) -> Outcome:
-    """Do a run; whatever it raises becomes its error."""
+_RUNNING = threading.local()
+"""`heard`: what the runs of the study at work in this thread have warned of."""
+
+
+def _is_new(record: logging.LogRecord) -> bool:
+    """Let a warning of a study's runs pass once, whatever the numbers in it: a thousand runs need not repeat it."""
+    heard = getattr(_RUNNING, "heard", None)
+    if heard is None or record.levelno > logging.WARNING:
+        return True
+    new = record.msg not in heard
+    heard.add(record.msg)
+    return new
+
+
+logging.getLogger("ctmhe.simulation.engine").addFilter(_is_new)
+
+
+def perform(case: Callable[..., Any], point: dict[str, Any], task: Task, heard: set[str]) -> Outcome:
+    """Do a run; whatever it raises becomes its error. `heard` are the warnings of the study's earlier runs here."""
     start = time.perf_counter()
+    outer, _RUNNING.heard = getattr(_RUNNING, "heard", None), heard  # a case may run a study of its own
     try:
-        with _heard_once():
-            answer = case(seed=task.seed, **point)
-        run, values = read_answer(answer)
+        run, values = read_answer(case(seed=task.seed, **point))
         if task.trajectory is not None:
             if run is None:
                 raise InputError("the case returned no Run: there is no trajectory to keep")
@@ -106,37 +121,8 @@ def perform(case: Callable[..., Any], point: dict[str, Any], task: Task) -> Outc
     except (Exception, SystemExit) as error:
         log.debug("a run failed", exc_info=True)
         return Outcome({}, f"{type(error).__name__}: {error}", time.perf_counter() - start)
-
-
-class _Once(logging.Filter):
-    """Lets a warning pass once a process, whatever the numbers in it: a thousand runs of a study need not repeat it."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.heard: set[str] = set()
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether a message is new."""
-        new = record.levelno > logging.WARNING or record.msg not in self.heard
-        self.heard.add(record.msg)
-        return new
-
-
-_ONCE = _Once()
-_REPEATED = ("ctmhe.simulation.engine", "ctmhe.simulation.loop")
-"""Loggers of what a run says at its end."""
-
-
-@contextmanager
-def _heard_once() -> Iterator[None]:
-    loggers = [logging.getLogger(name) for name in _REPEATED]
-    for logger in loggers:
-        logger.addFilter(_ONCE)
-    try:
-        yield
     finally:
-        for logger in loggers:
-            logger.removeFilter(_ONCE)
+        _RUNNING.heard = outer
 
 
 def execute(
@@ -164,8 +150,8 @@ def execute(
         At once, when the case or a value cannot be sent to another process.
     """
     if not tasks or (executor is None and workers == 1):
-        points = list(design)
-        return ((task, perform(case, points[task.point], task)) for task in tasks)
+        points, heard = list(design), set[str]()
+        return ((task, perform(case, points[task.point], task, heard)) for task in tasks)
     book = Book.of(case, design)
     if executor is None:
         pool: _Pool = _Processes(min(workers, len(tasks)))
@@ -247,7 +233,7 @@ def _work(digest: str, content: Any, parameters: tuple[str, ...], task: Task) ->
             return None
         try:
             _KNOWN.digest, _KNOWN.book = None, None
-            _KNOWN.book = pickle.loads(content)
+            _KNOWN.book, _KNOWN.heard = pickle.loads(content), set()
             _KNOWN.digest = digest
         except Exception as error:
             raise InputError(
@@ -255,7 +241,7 @@ def _work(digest: str, content: Any, parameters: tuple[str, ...], task: Task) ->
                 "same packages, and the module of the case"
             ) from error
     case, values = _KNOWN.book
-    outcome = perform(case, dict(zip(parameters, values[task.point], strict=True)), task)
+    outcome = perform(case, dict(zip(parameters, values[task.point], strict=True)), task, _KNOWN.heard)
     _KNOWN.runs = getattr(_KNOWN, "runs", 0) + 1
     if _KNOWN.runs == RENEW_AFTER and "joblib.externals.loky.process_executor" in sys.modules:
         # loky replaces a worker, without losing a task, when it has grown by more than this since its first one

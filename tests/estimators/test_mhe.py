@@ -16,6 +16,19 @@ from ctmhe.transcription import CVODES, RK4
 from ctmhe.types import Bounds, DiscountedCost, Input, Measurement, Outcome
 from tests.conftest import REACTOR_COST, feed, linear_model, oscillator_mhe
 
+DRIVEN = {
+    hold: MHE(
+        ContinuousModel(
+            lambda t, x, u, w, p: (x[1], ca.sin(x[0]) + u[0] + w[0]),
+            lambda t, x, u, w, p: (x[0] * x[1] + u[0], x[1]),
+            x=("a", "b"), u="force", w="push", y=("mixed", "speed"),
+        ),
+        horizon=3.0, interval=0.2, integrator=RK4(0.05), cost=DiscountedCost(P=1.0, Q=1.0, R_point=1.0), hold="point",
+        input_hold=hold,
+    )
+    for hold in ("zero", "linear")
+}  # fmt: skip
+
 
 def reactor_mhe(**changes):
     """The reactor of thesis 3.4.1 on a coarse grid."""
@@ -546,3 +559,22 @@ def test_cvodes_estimates_a_stiff_plant_where_rk4_of_equal_cost_cannot_even_pred
     explicit = MHE(model, integrator=RK4(0.05), **options)
     ahead = explicit.propagate(explicit.init(x=truth), 60.0, 70.0, truth, model.p_start)  # of the FMU: held, it fails
     assert not np.allclose(ahead, plant.state(), atol=0.01)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    hold=st.sampled_from(["zero", "linear"]),
+    switches=st.lists(st.floats(0.01, 1.9), max_size=4),
+    t0=st.floats(0.0, 1.0),
+    ahead=st.floats(0.0, 0.9),
+)
+def test_carrying_on_gives_the_propagated_state_and_its_output(hold, switches, t0, ahead):
+    """Within a cell, over many, across inputs that switch: the state of `propagate`, the output of `output` there."""
+    mhe = DRIVEN[hold]
+    state = mhe.control(mhe.init(x=[0.5, -0.2]), Input(0.0, [0.3]))
+    for t in sorted(switches):
+        state = mhe.control(state, Input(t, [np.sin(9 * t)]))
+    start, p = np.array([0.5, -0.2]), np.empty(0)
+    x, y = mhe.carry(state, t0, t0 + ahead, start, p)
+    np.testing.assert_array_equal(x, mhe.propagate(state, t0, t0 + ahead, start, p))
+    np.testing.assert_allclose(y, mhe.output(state, t0 + ahead, x, p), rtol=1e-12, atol=1e-14)

@@ -94,6 +94,14 @@ def test_errors_are_what_their_names_say(result):
     assert result.ise == pytest.approx(np.sum(np.diff(result.t) * (squares[1:] + squares[:-1]) / 2))
     with pytest.raises(InputError, match="unknown state 'velocity'"):
         result.online_rms("velocity")
+    late = result.t >= 0.5
+    assert result.online_rms(since=0.5) == pytest.approx(np.sqrt(np.mean(np.sum(online[late] ** 2, axis=1))))
+    assert result.online_rms(("position", "speed")) == result.online_rms()
+    assert result.retrospective_rms("speed", since=0.5) == pytest.approx(np.sqrt(np.mean(retro[late, 1] ** 2)))
+    with pytest.raises(InputError, match="no monitoring time at or after since = 99"):
+        result.online_rms(since=99)
+    with pytest.raises(InputError, match="unknown state"):
+        result.online_rms([])
 
 
 def test_axes_carry_names_and_units(result):

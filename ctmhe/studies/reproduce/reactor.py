@@ -6,8 +6,6 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-import numpy as np
-
 from ctmhe.estimators.mhe import MHE
 from ctmhe.models.library import batch_reactor
 from ctmhe.simulation import OdePlant, Run, SingleSample, Uniform, WholeSignal, simulate
@@ -67,8 +65,7 @@ def run_reactor(*, seed: int, policy: Trigger, channel: str = "whole signal") ->
         monitor=STEP,
         seed=seed,
     )
-    error = run.online_error().to_numpy()[run.t >= SETTLED]
-    return run, {"settled_rms": float(np.sqrt(np.mean(np.sum(error**2, axis=1))))}
+    return run, {"settled_rms": run.online_rms(since=SETTLED)}
 
 
 @cache

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from ctmhe.errors import MissingExtra
 from ctmhe.estimators.mhe import MHE
 from ctmhe.models.library import batch_reactor
 from ctmhe.simulation import Run, Uniform, WholeSignal, simulate
@@ -152,7 +153,10 @@ def reproduce(*, seeds: int = 20, workers: int = 1, progress: bool = False) -> d
     if workers == 1:
         found = [one_sampling(kind, range(seeds), progress=progress) for kind in kinds]
     else:
-        from joblib import Parallel, delayed
+        try:
+            from joblib import Parallel, delayed
+        except ImportError:
+            raise MissingExtra("joblib", "study", "reproducing a case on several workers") from None
 
         found = Parallel(workers)(delayed(one_sampling)(kind, range(seeds), progress=progress) for kind in kinds)
     ours = dict(zip(kinds, found, strict=True))
