@@ -89,27 +89,29 @@ class Book:
         return cls(sha256(content).hexdigest(), content)
 
 
+_HEARD: set[str] = set()
+"""What runs of studies have warned of in this process."""
+
 _RUNNING = threading.local()
-"""`heard`: what the runs of the study at work in this thread have warned of."""
+"""`depth`: how many runs of studies this thread is within; a case may run a study of its own."""
 
 
 def _is_new(record: logging.LogRecord) -> bool:
-    """Let a warning of a study's runs pass once, whatever the numbers in it: a thousand runs need not repeat it."""
-    heard = getattr(_RUNNING, "heard", None)
-    if heard is None or record.levelno > logging.WARNING:
+    """Let a warning of a study's runs pass once a process, whatever the numbers in it: searches run many studies."""
+    if not getattr(_RUNNING, "depth", 0) or record.levelno > logging.WARNING:
         return True
-    new = record.msg not in heard
-    heard.add(record.msg)
+    new = record.msg not in _HEARD
+    _HEARD.add(record.msg)
     return new
 
 
 logging.getLogger("ctmhe.simulation.engine").addFilter(_is_new)
 
 
-def perform(case: Callable[..., Any], point: dict[str, Any], task: Task, heard: set[str]) -> Outcome:
-    """Do a run; whatever it raises becomes its error. `heard` are the warnings of the study's earlier runs here."""
+def perform(case: Callable[..., Any], point: dict[str, Any], task: Task) -> Outcome:
+    """Do a run; whatever it raises becomes its error."""
     start = time.perf_counter()
-    outer, _RUNNING.heard = getattr(_RUNNING, "heard", None), heard  # a case may run a study of its own
+    _RUNNING.depth = getattr(_RUNNING, "depth", 0) + 1
     try:
         run, values = read_answer(case(seed=task.seed, **point))
         if task.trajectory is not None:
@@ -122,7 +124,7 @@ def perform(case: Callable[..., Any], point: dict[str, Any], task: Task, heard: 
         log.debug("a run failed", exc_info=True)
         return Outcome({}, f"{type(error).__name__}: {error}", time.perf_counter() - start)
     finally:
-        _RUNNING.heard = outer
+        _RUNNING.depth -= 1
 
 
 def execute(
@@ -150,8 +152,8 @@ def execute(
         At once, when the case or a value cannot be sent to another process.
     """
     if not tasks or (executor is None and workers == 1):
-        points, heard = list(design), set[str]()
-        return ((task, perform(case, points[task.point], task, heard)) for task in tasks)
+        points = list(design)
+        return ((task, perform(case, points[task.point], task)) for task in tasks)
     book = Book.of(case, design)
     if executor is None:
         pool: _Pool = _Processes(min(workers, len(tasks)))
@@ -233,7 +235,7 @@ def _work(digest: str, content: Any, parameters: tuple[str, ...], task: Task) ->
             return None
         try:
             _KNOWN.digest, _KNOWN.book = None, None
-            _KNOWN.book, _KNOWN.heard = pickle.loads(content), set()
+            _KNOWN.book = pickle.loads(content)
             _KNOWN.digest = digest
         except Exception as error:
             raise InputError(
@@ -241,7 +243,7 @@ def _work(digest: str, content: Any, parameters: tuple[str, ...], task: Task) ->
                 "same packages, and the module of the case"
             ) from error
     case, values = _KNOWN.book
-    outcome = perform(case, dict(zip(parameters, values[task.point], strict=True)), task, _KNOWN.heard)
+    outcome = perform(case, dict(zip(parameters, values[task.point], strict=True)), task)
     _KNOWN.runs = getattr(_KNOWN, "runs", 0) + 1
     if _KNOWN.runs == RENEW_AFTER and "joblib.externals.loky.process_executor" in sys.modules:
         # loky replaces a worker, without losing a task, when it has grown by more than this since its first one
