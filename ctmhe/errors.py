@@ -41,6 +41,10 @@ class SolverError(CtmheError, RuntimeError):
     """A numerical tool could not be set up (never raised for a solve that merely fails: see `Status`)."""
 
 
+class CertificateError(CtmheError, ValueError):
+    """No certificate: the condition cannot be met, or could not be checked; the text says what to try."""
+
+
 class FmuError(CtmheError, RuntimeError):
     """An FMU cannot be read, loaded, evaluated or used in the role that it was given."""
 

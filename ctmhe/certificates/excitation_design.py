@@ -1,0 +1,397 @@
+"""How output differences bound parameter differences: the design behind the excitation monitor, thesis 7.2.
+
+One function carries the proofs of thesis 7.2 and of Theorem 10 of the joint estimation paper (000)::
+
+    W = |z|^2_P + |dp|^2_S,  z = dx - Y dp,  Y+ = Phi Y + E + L F,  S+ = mu S + (C Y + F)' (C Y + F)
+
+Along every pair of trajectories in the domain W+ <= mu W + |dw|^2_Q + |dy|^2_R. There this follows from (7.41) by
+Young's inequality, with numbers eps, gamma, or a, eps1, eps2, that have to be tuned. Here it is asked for directly. Since
+C Y dp + F dp = dy - C z - D dw, it reads ::
+
+    |Phi z + (B + L D) dw - L dy|^2_P + |dy - C z - D dw|^2 <= mu |z|^2_P + |dw|^2_Q + |dy|^2_R
+
+for all z, dw, dy: a linear matrix inequality in (P, P L, Q, R), whose solution is at least as good as the best choice of
+those numbers (gamma = a = 1, since W may be scaled). (7.41) is its part dw = dy = 0. In continuous time, with
+-kappa = ln mu, dY/dt = Phi Y + E + L F, dS/dt = -kappa S + (C Y + F)' (C Y + F),
+
+    2 z'P (Phi z + (B + L D) dw - L dy) + |dy - C z - D dw|^2 <= -kappa |z|^2_P + |dw|^2_Q + |dy|^2_R
+
+gives dW/dt <= -kappa W + |dw|^2_Q + |dy|^2_R. Both are convex in A and B where C and D are constant, so that they hold
+for the mean values of every pair if they hold on a hull of the point values.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy.linalg import eigh
+from scipy.optimize import minimize_scalar
+
+from ctmhe.certificates.increments import Cover, Increments, Jacobians
+from ctmhe.certificates.injection import Units, design, least_upper_bound, phi_factor, regressor, slack
+from ctmhe.errors import CertificateError, InputError
+from ctmhe.models.continuous import Model
+from ctmhe.types import Array, Bounds, frozen, positive
+
+FRESH = 400
+
+
+@dataclass(frozen=True, eq=False)
+class ExcitedSet:
+    """The matrices of E_T (Definitions 5.1 and 5.2): how output differences bound the parameters'.
+
+    For every pair of trajectories over T whose information is at least the level it was made for::
+
+        |dp|^2_S <= eta^T |dx(0)|^2_P + sum of eta^(T-1-j) ( |dw(j)|^2_Q + |dy(j)|^2_R )
+
+    In continuous time the sum is an integral and eta a factor per second. With parameters that vary, dp is their
+    difference at the start and the sum is not discounted (5.75).
+    """
+
+    S: Array
+    P: Array
+    Q: Array
+    R: Array
+    eta: float
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """W+ <= mu W + |dw|^2_Q + |dy|^2_R for parameters that vary, p+ = p + B_p w (7.73b) or dp/dt = B_p w.
+
+    Attributes
+    ----------
+    B_p : array (np, nw)
+    mu : float
+        Contraction of W; information still fades with the design's own.
+    Q, R : array
+    Y : float
+        |Y v|_P <= Y |v| along every pair: (7.78) with its best eps3.
+    S : float
+        |S| <= S (7.85).
+    """
+
+    B_p: Array
+    mu: float
+    Q: Array
+    R: Array
+    Y: float
+    S: float
+
+
+@dataclass(frozen=True, eq=False)
+class ExcitationDesign:
+    """An injection L(z1, z2) and weights with which excitation can be monitored; made by `design_excitation`.
+
+    Attributes
+    ----------
+    increments : Increments
+        Model and domain.
+    P : array (nx, nx), Q : array (nw, nw), R : array (ny, ny)
+        Of W and its inequality, in y's units squared.
+    mu : float
+        Factor per step, or second, by which W and old information fade.
+    eta : float
+        The smallest for which (7.41) holds with P on the domain; not above mu.
+    L : array (nx, ny)
+        Injection where the mean value of A is `A`.
+    A : array (nx, nx) or None
+        L(z1, z2) = L - (A(z1, z2) - A) C^+ where given; the injection is constant where None.
+    C : array (ny, nx)
+        At the centre of the domain; constant where `A` is given.
+    Phi : array (nx, nx) or None
+        Where it is constant.
+    scope : str
+        `global`: the information of one trajectory is that of every pair with it (Corollary 7.2); `local`: nearly that
+        of pairs near it (Proposition 7.2).
+    H : array (ny, ny) or None
+        Of (7.68), if there is one, from samples. Nothing here rests on it: see `Increments.between`.
+    method : str
+        How the domain was covered, see `Cover`.
+    rigorous : bool
+        Whether that is a proof.
+    margin : float
+        Smallest eigenvalue of the inequality at fresh random pairs and on the cover, in nominal units, over tr R.
+    worst : tuple of two arrays (nv,)
+        The fresh pair (x, u, w, p) with the smallest one.
+    drift : Drift or None
+    notes : tuple of str
+    """
+
+    increments: Increments = field(repr=False)
+    P: Array
+    Q: Array
+    R: Array
+    mu: float
+    eta: float
+    L: Array
+    A: Array | None
+    C: Array
+    Phi: Array | None
+    scope: str
+    H: Array | None
+    method: str
+    rigorous: bool
+    margin: float
+    worst: tuple[Array, Array]
+    drift: Drift | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def model(self) -> Model:
+        """The model."""
+        return self.increments.model
+
+    @property
+    def discrete(self) -> bool:
+        """Whether it counts steps."""
+        return self.model.step is not None
+
+    def injection(self, A: Array) -> Array:
+        """Return L (k, nx, ny) for Jacobians A (k, nx, nx)."""
+        constant = np.broadcast_to(self.L, (len(A), *self.L.shape))
+        return constant if self.A is None else constant - (A - self.A) @ np.linalg.pinv(self.C)
+
+    def recursion(self, jacobians: Jacobians) -> tuple[Array, Array, Array, Array]:
+        """Return Phi, E + L F, C, F of (7.45) at k points or pairs."""
+        A, _, E, C, _, F = jacobians
+        L = self.injection(A)
+        return A + L @ C, E + L @ F, C, F
+
+    def slack(self, jacobians: Jacobians) -> Array:
+        """Return by how much the inequality holds (k,), as in `margin`."""
+        weights = (self.P, self.Q, self.R)
+        return slack(Units.of(self.model), self.mu, weights, self.injection(jacobians.A), jacobians)
+
+    def excited_set(self, alpha: float, *, horizon: float | None = None) -> ExcitedSet:
+        """Return the matrices of E_T for pairs whose information C_T is at least alpha I (7.44), (7.75).
+
+        Parameters
+        ----------
+        alpha : float
+            In y's units squared over p's.
+        horizon : float
+            T, in steps or seconds; only where parameters vary, and always there. The thesis' matrices for that case do
+            not depend on it, but the last step of its proof drops squares: |dp(0)|^2 <= 2 |dp(T)|^2 + 2 T sum of
+            |B_p dw|^2.
+        """
+        alpha = positive("excited_set: alpha", alpha)
+        S = alpha * np.eye(len(self.model.p))
+        drift = self.drift
+        if drift is None:
+            if horizon is not None:
+                raise InputError("excited_set: with constant parameters the matrices do not depend on T; omit horizon")
+            return ExcitedSet(frozen(S), self.P, self.Q, self.R, self.mu)
+        T = positive("excited_set: horizon", horizon, "steps" if self.discrete else "seconds")
+        Q = drift.Q + alpha * T * drift.B_p.T @ drift.B_p
+        return ExcitedSet(frozen(S / 2), self.P, frozen(Q), drift.R, drift.mu)
+
+    def __str__(self) -> str:
+        per = "step" if self.discrete else "second"
+        rows = (
+            f"Excitation of {self.model.name!r}: W fades by mu = {self.mu:.4g} per {per}; (7.41) with {self.eta:.4g}",
+            f"  Phi {'constant' if self.Phi is not None else 'varies'}; from one trajectory: {self.scope}",
+            f"  domain: {self.method}, {'proof' if self.rigorous else 'evidence'}; margin {self.margin:.2g}",
+            *(f"  {note}" for note in self.notes),
+        )
+        return "\n".join(rows)
+
+
+def design_excitation(
+    model: Model,
+    domain: Bounds | None = None,
+    *,
+    u: Any = None,
+    mu: float | None = None,
+    horizon: float | None = None,
+    B_p: Any = None,
+) -> ExcitationDesign:
+    """Find L(z1, z2), P, Q, R with which excitation can be monitored on a domain: thesis (7.40)-(7.41), (7.55)-(7.57).
+
+    Where outputs are linear, L follows A, so that Phi is as constant as they allow. If it is constant, f affine in p and
+    h free of it, the result is global: Corollary 7.2, which also asks for (7.65) and (7.68).
+
+    Parameters
+    ----------
+    model : Model
+        With parameters p; discrete or continuous.
+    domain : Bounds, optional
+        Of x, w and p; the model's own bounds when left out. Signals on which no Jacobian depends may be free. It need
+        not be invariant: what is claimed holds for pairs that stay inside.
+    u : box, optional
+        Range of the inputs.
+    mu : float in (0, 1), optional
+        Factor per step or second. When left out, the one for which noise of nominal size and a wrong start disturb the
+        parameters least, judged by the regressor at rest.
+    horizon : float, optional
+        Steps or seconds from which parameters are to be judged: the shorter, the faster a wrong start has to fade. 200
+        times the model's fastest time constant when left out. What is claimed holds for any T.
+    B_p : array (np, nw), optional
+        Parameters vary: p+ = p + B_p w, or dp/dt = B_p w (7.73b).
+
+    Raises
+    ------
+    CertificateError
+        If there is no such injection, with a mode that shows it where one is known.
+    InputError
+        For a model without parameters, a domain without bounds where they matter, numbers out of range.
+    """
+    if not len(model.p):
+        raise InputError(f"design_excitation: model {model.name!r} has no parameters; name some with p=")
+    if mu is not None and not 0 < mu < 1:
+        raise InputError(f"design_excitation: mu must lie in (0, 1), a factor per step or second, got {mu}")
+    increments, units = Increments(model, domain, u=u), Units.of(model)
+    if B_p is not None:
+        B_p = np.asarray(B_p, dtype=float)
+        if B_p.shape != (len(model.p), len(model.w)):
+            expected = f"({len(model.p)}, {len(model.w)}), parameters by disturbances"
+            raise InputError(f"design_excitation: B_p must have shape {expected}, got {B_p.shape}")
+    cover, notes = _cover(increments)
+    points, centre = cover.jacobians, increments.at(increments.centre)
+    linear = _constant(points.C) and _constant(points.D)
+    compensated = linear and not _constant(points.A)
+    unseen = np.eye(len(units.x)) - np.linalg.pinv(centre.C[0]) @ centre.C[0]
+    fixed = linear and _constant(points.A @ unseen)
+    pace = units.pace(centre)
+    T = 200.0 / pace if horizon is None else positive("design_excitation: horizon", horizon)
+    samples = increments.at(increments.random(64, np.random.default_rng(2)))
+
+    def attempt(factor: float) -> tuple[float, Any]:
+        value, *found, L = design(units, points, centre, factor, T, compensated=compensated)
+        Phi = centre.A[0] + L @ centre.C[0]
+        seen = regressor(units, Phi, samples.E + L @ samples.F, centre.C[0], samples.F)
+        return value / max(seen, 1e-12), (*found, L)
+
+    try:
+        mu = _best_factor(attempt, pace, units.discrete) if mu is None else float(mu)
+        P, Q, R, L = attempt(mu)[1]
+    except CertificateError as error:
+        raise CertificateError(f"design_excitation: {_why_not(centre, mu, units.discrete, model)}{error}") from None
+    made = ExcitationDesign(
+        increments, frozen(P), frozen(Q), frozen(R), mu, mu, frozen(L),
+        A=frozen(centre.A[0]) if compensated else None, C=frozen(centre.C[0]),
+        Phi=frozen(centre.A[0] + L @ centre.C[0]) if fixed else None,
+        scope="global" if fixed and _follows_one(increments, compensated) else "local", H=None,
+        method=cover.method, rigorous=cover.rigorous, margin=np.nan, worst=(increments.centre,) * 2, notes=notes,
+    )  # fmt: skip
+    made = _verified(made, points)
+    return made if B_p is None else replace(made, drift=_drift(made, points, B_p))
+
+
+def _cover(increments: Increments) -> tuple[Cover, tuple[str, ...]]:
+    cover = increments.cover("ABCD")
+    if _constant(cover.jacobians.C) and _constant(cover.jacobians.D):
+        return cover, ()
+    pairs = increments.between(*increments.random_pairs(100, np.random.default_rng(3)))
+    both = Jacobians(*(np.concatenate(parts) for parts in zip(cover.jacobians, pairs, strict=True)))
+    note = "outputs are not linear: mean values of their Jacobians over pairs were sampled"
+    return Cover(both, "grid", False), (note,)
+
+
+def _constant(parts: Array) -> bool:
+    """Return whether k matrices are the same, to rounding."""
+    return bool(np.ptp(parts, axis=0).max(initial=0.0) <= 1e-11 * np.abs(parts).max(initial=1.0))
+
+
+def _best_factor(attempt: Any, pace: float, discrete: bool) -> float:
+    """Return mu of the least score: a coarse search over rates, then a fine one."""
+    rates = pace * np.logspace(-2.5, 0.5, 8)
+    rates = rates[rates < 4.0] if discrete else rates
+
+    def score(log_rate: float) -> float:
+        try:
+            return float(np.log(attempt(float(np.exp(-np.exp(log_rate))))[0]))
+        except CertificateError:
+            return 1e3
+
+    scores = [score(np.log(rate)) for rate in rates]
+    best = int(np.argmin(scores))
+    if scores[best] >= 1e3:
+        return float(np.exp(-rates[0]))
+    edges = np.log(rates[[max(best - 1, 0), min(best + 1, len(rates) - 1)]])
+    found: Any = minimize_scalar(score, bounds=tuple(edges), method="bounded", options={"maxiter": 8})
+    return float(np.exp(-np.exp(found.x) if found.fun < scores[best] else -rates[best]))
+
+
+def _why_not(centre: Jacobians, mu: float | None, discrete: bool, model: Model) -> str:
+    """Return a sentence that names a mode which is not seen and fades too slowly, if the centre has one."""
+    A, C = centre.A[0], centre.C[0]
+    limit = np.sqrt(mu or 1.0) if discrete else np.log(mu or 1.0) / 2
+    for value, mode in zip(*[part.T for part in np.linalg.eig(A)], strict=True):
+        if (abs(value) if discrete else value.real) >= limit and np.linalg.norm(C @ mode) < 1e-8 * np.linalg.norm(C):
+            parts = ", ".join(f"{name} {abs(part):.2g}" for name, part in zip(model.x.names, mode, strict=True))
+            return f"outputs do not see the mode ({parts}) with eigenvalue {value:.3g}, which fades too slowly; "
+    return ""
+
+
+def _follows_one(increments: Increments, compensated: bool) -> bool:
+    """Return whether E, L F and F of a pair depend on its first point only."""
+    if not increments.symbolic:
+        return False
+    v1, v2 = increments.random_pairs(32, np.random.default_rng(4))
+    moved = v1.copy()
+    moved[:, increments.place["p"]] = v2[:, increments.place["p"]]
+    here, there = increments.at(v1), increments.at(moved)
+    same = np.allclose(here.E, there.E, rtol=1e-12, atol=1e-14) and np.allclose(here.F, there.F, rtol=1e-12, atol=1e-14)
+    return bool(same and not (compensated and here.F.any()))
+
+
+def _verified(made: ExcitationDesign, points: Jacobians) -> ExcitationDesign:
+    """Return the design with what fresh pairs say of it: margin, eta, H."""
+    v1, v2 = made.increments.random_pairs(FRESH, np.random.default_rng(5))
+    fresh = made.increments.between(v1, v2)
+    at_pairs = made.slack(fresh)
+    margin = float(min(at_pairs.min(), made.slack(points).min()))
+    if margin < -1e-10:
+        raise CertificateError(
+            f"design_excitation: the inequality fails by {-margin:.2g} (nominal units, relative to R) at points that the "
+            f"solver did not see, or by its inaccuracy. Try another mu than {made.mu:.4g}, a smaller domain, or nominal= "
+            "nearer to the sizes of the signals"
+        )
+    Phi = np.concatenate([made.recursion(part)[0] for part in (fresh, points)])
+    eta = max(phi_factor(made.P, phi, discrete=made.discrete) for phi in Phi)
+    worst = int(at_pairs.argmin())
+    return replace(made, margin=margin, worst=(frozen(v1[worst]), frozen(v2[worst])), eta=eta, H=regressor_bound(made))
+
+
+def regressor_bound(made: ExcitationDesign) -> Array | None:
+    """Return H of (7.68) if f is affine in p, outputs are linear, and the regressor varies only with what they show."""
+    increments, place = made.increments, made.increments.place["p"]
+    v = np.vstack([increments.random(200, np.random.default_rng(6)), increments.corners()])
+    zero, double = v.copy(), v.copy()
+    zero[:, place], double[:, place] = 0.0, 2 * v[:, place]
+    here, none, twice = (increments.at(points) for points in (v, zero, double))
+    change, inverse = here.A - none.A, np.linalg.pinv(made.C)
+    hidden = np.abs(change - change @ inverse @ made.C).max(initial=0.0)
+    affine = np.allclose(twice.A - none.A, 2 * change) and not here.F.any() and np.allclose(here.C, made.C)
+    if not affine or hidden > 1e-9 * np.abs(change).max(initial=1e-300):
+        return None
+    seen = change @ inverse
+    return frozen(least_upper_bound(seen.transpose(0, 2, 1) @ made.P @ seen, Units.of(made.model).y))
+
+
+def _drift(made: ExcitationDesign, points: Jacobians, B_p: Array) -> Drift:
+    """Return what W needs for parameters that vary: thesis 7.2.2, where the proof drops B_p after (7.83).
+
+    Y enters by Young's inequality on the whole step: W+ <= (1 + e) W+(constant) + (1 + 1/e) (|Y B_p dw|^2_P +
+    |B_p dw|^2_S); in continuous time 2 |z'P Y B_p dw| + 2 |dp'S B_p dw| <= e W + (1/e) (the same).
+    """
+    P, mu, discrete, rate = made.P, made.mu, made.discrete, -np.log(made.mu)
+    other, L = made.increments.cover("EF").jacobians, made.injection(points.A)
+    forces = (other.E[:, None] + L[None] @ other.F[:, None]).reshape(-1, *other.E.shape[1:])
+    force = np.sqrt(max(np.linalg.eigvalsh(G.T @ P @ G)[-1] for G in forces))
+    Y = force / (1 - np.sqrt(made.eta)) if discrete else -2 * force / np.log(made.eta)
+    seen = np.sqrt(max(eigh(C.T @ C, P, eigvals_only=True)[-1] for C in points.C))
+    feed = max(np.linalg.norm(F, 2) for F in other.F)
+    S = (seen * Y + feed) ** 2 / ((1 - mu) if discrete else rate)
+    added = (Y**2 + S) * B_p.T @ B_p
+    if discrete:
+        contraction = (1 + mu) / 2
+        e = contraction / mu - 1
+        Q, R = (1 + e) * made.Q + (1 + 1 / e) * added, (1 + e) * made.R
+    else:
+        e = rate / 2
+        contraction, Q, R = np.exp(e - rate), made.Q + added / e, made.R
+    return Drift(frozen(B_p), float(contraction), frozen(Q), frozen(R), float(Y), float(S))

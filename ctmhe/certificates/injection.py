@@ -1,0 +1,136 @@
+"""The matrix inequality behind excitation monitoring, as a semidefinite program; `excitation_design` derives it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag, eigh
+
+from ctmhe.certificates.increments import Jacobians
+from ctmhe.certificates.lmi import require_cvxpy, solved
+from ctmhe.models.continuous import Model
+from ctmhe.types import Array
+
+SLACK = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Units:
+    """Nominal magnitudes as diagonal matrices, and whether the model counts steps."""
+
+    x: Array
+    w: Array
+    y: Array
+    p: Array
+    discrete: bool
+
+    @classmethod
+    def of(cls, model: Model) -> Units:
+        """Return those of a model."""
+        sizes = (np.diag(np.asarray(getattr(model, key).nominal)) for key in "xwyp")
+        return cls(*sizes, discrete=model.step is not None)
+
+    def scaled(self, jacobians: Jacobians) -> Jacobians:
+        """Return Jacobians between signals divided by their nominals."""
+        x, y = np.linalg.inv(self.x), np.linalg.inv(self.y)
+        rows, columns = (x, x, x, y, y, y), (self.x, self.w, self.p) * 2
+        return Jacobians(*(r @ part @ c for r, part, c in zip(rows, jacobians, columns, strict=True)))
+
+    def pace(self, jacobians: Jacobians) -> float:
+        """Return a rate of the model, per step or second: the largest of A, or of A - I."""
+        A = self.scaled(jacobians).A - (np.eye(len(self.x)) if self.discrete else 0.0)
+        return float(np.linalg.norm(A, 2, axis=(1, 2)).max()) or 1.0
+
+
+def slack(units: Units, mu: float, weights: tuple[Array, Array, Array], L: Array, jacobians: Jacobians) -> Array:
+    """Return by how much the inequality holds at k points (k,): the smallest eigenvalue in nominal units, over tr R.
+
+    `weights` are P, Q, R; `L` is (k, nx, ny).
+    """
+    P, Q, R = weights
+    A, B, _, C, D, _ = jacobians
+    n, rate = len(P), -np.log(mu)
+    identity = np.broadcast_to(np.eye(len(R)), (len(A), *R.shape))
+    gain = np.concatenate([A + L @ C, B + L @ D, -L], axis=2)
+    seen = np.concatenate([-C, -D, identity], axis=2)
+    left = seen.transpose(0, 2, 1) @ seen
+    if units.discrete:
+        left = left + gain.transpose(0, 2, 1) @ P @ gain
+    else:
+        left[:, :n] += P @ gain
+        left[:, :, :n] += (P @ gain).transpose(0, 2, 1)
+    right = block_diag(mu * P if units.discrete else -rate * P, Q, R)
+    scale = block_diag(units.x, units.w, units.y)
+    matrices = scale @ (right - left) @ scale
+    return np.linalg.eigvalsh((matrices + matrices.transpose(0, 2, 1)) / 2)[:, 0] / np.trace(units.y @ R @ units.y)
+
+
+def design(
+    units: Units, points: Jacobians, centre: Jacobians, mu: float, horizon: float, *, compensated: bool
+) -> tuple[float, Array, Array, Array, Array]:
+    """Return the value of the program, and P, Q, R, L at the centre, in the model's units.
+
+    The value is what noise of nominal size adds to W in steps, and a wrong start of nominal size over the horizon, per
+    nominal |y|^2. `compensated`: L follows A, so that only the part of A that outputs do not see varies in Phi.
+    """
+    cp = require_cvxpy()
+    pace = 1.0 if units.discrete else units.pace(points)  # the program's unit of time: entries of size one
+    points, centre = units.scaled(points), units.scaled(centre)
+    n, nw, ny = points.A.shape[1], points.B.shape[2], points.C.shape[1]
+    size = float(np.mean(np.diag(units.y) ** 2))
+    P, R, Y = cp.Variable((n, n), symmetric=True), cp.Variable((ny, ny), symmetric=True), cp.Variable((n, ny))
+    Q = cp.Variable((nw, nw), symmetric=True) if nw else None
+    m = n + nw + ny
+    in_z, in_w, in_y = np.split(np.eye(m), [n, n + nw], axis=1)
+    inverse, rate = np.linalg.pinv(centre.C[0]), -np.log(mu) / pace
+    constraints: list[Any] = [P >> SLACK * np.eye(n)]
+    for A, B, C, D in zip(points.A, points.B, points.C, points.D, strict=True):
+        PL = Y - P @ ((A - centre.A[0]) @ inverse / pace) if compensated else Y
+        gain = P @ (np.hstack([A, B, np.zeros((n, ny))]) / pace) + PL @ np.hstack([C, D, -np.eye(ny)])
+        seen = np.hstack([-C, -D, np.eye(ny)])
+        matrix = in_y @ R @ in_y.T - seen.T @ (units.y**2 / size) @ seen
+        matrix = matrix + in_w @ Q @ in_w.T if Q is not None else matrix
+        if units.discrete:
+            matrix = cp.bmat([[mu * (in_z @ P @ in_z.T) + matrix, gain.T], [gain, P]])
+        else:
+            half = in_z @ gain
+            matrix = matrix - rate * (in_z @ P @ in_z.T) - half - half.T
+        constraints.append((matrix + matrix.T) / 2 >> SLACK * np.eye(matrix.shape[0]))
+    left = np.exp(-rate * pace * horizon)
+    cost = cp.trace(R) + (rate * left / (1 - left) + 1e-6) * cp.trace(P) + (cp.trace(Q) if Q is not None else 0.0)
+    value = solved(cp.Problem(cp.Minimize(cost), constraints))
+    x, w, y = (np.linalg.inv(part) for part in (units.x, units.w, units.y))
+    L = pace * units.x @ np.linalg.solve(P.value, Y.value) @ y
+    weights = (x @ P.value @ x / pace, w @ (Q.value if Q is not None else np.zeros((0, 0))) @ w, y @ R.value @ y)
+    return value, *(size * (part + part.T) / 2 for part in weights), L
+
+
+def regressor(units: Units, Phi: Array, G: Array, C: Array, F: Array) -> float:
+    """Return the mean square of C Y + F at rest for k regressors G, F, in nominal units per nominal |y|^2."""
+    n = len(Phi)
+    rest = np.linalg.solve(np.eye(n) - Phi if units.discrete else -Phi, G)
+    return float(np.mean(np.sum(((C @ rest + F) @ units.p) ** 2, axis=(1, 2))) / np.mean(np.diag(units.y) ** 2))
+
+
+def phi_factor(P: Array, Phi: Array, *, discrete: bool = True) -> float:
+    """Return the smallest eta with Phi'P Phi <= eta P (7.41); in continuous time with P Phi + Phi'P <= ln(eta) P."""
+    left = Phi.T @ P @ Phi if discrete else P @ Phi + Phi.T @ P
+    largest = float(eigh(left, P, eigvals_only=True)[-1])
+    return largest if discrete else float(np.exp(largest))
+
+
+def least_upper_bound(matrices: Array, units: Array) -> Array:
+    """Return the H of least trace, in units (n, n) diagonal, that is not below any of the `matrices` (k, n, n)."""
+    n = matrices.shape[1]
+    if n <= 1 or len(matrices) == 1:
+        return matrices.max(axis=0)
+    cp = require_cvxpy()
+    scaled = units @ matrices @ units
+    scaled, size = scaled / np.abs(scaled).max(), np.abs(scaled).max()
+    H = cp.Variable((n, n), symmetric=True)
+    solved(cp.Problem(cp.Minimize(cp.trace(H)), [H >> matrix for matrix in scaled]))
+    lifted = H.value + max(0.0, *(float(np.linalg.eigvalsh(m - H.value)[-1]) for m in scaled)) * np.eye(n)
+    back = np.linalg.inv(units)
+    return size * back @ lifted @ back
