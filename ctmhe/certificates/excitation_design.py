@@ -30,7 +30,7 @@ from scipy.linalg import eigh
 from scipy.optimize import minimize_scalar
 
 from ctmhe.certificates.increments import Cover, Increments, Jacobians
-from ctmhe.certificates.injection import Units, design, least_upper_bound, phi_factor, regressor, slack
+from ctmhe.certificates.injection import SLACKS, Units, design, gathered, least_upper_bound, phi_factor, slack
 from ctmhe.errors import CertificateError, InputError
 from ctmhe.models.continuous import Model
 from ctmhe.types import Array, Bounds, frozen, positive
@@ -223,8 +223,8 @@ def design_excitation(
     u : box, optional
         Range of the inputs.
     mu : float in (0, 1), optional
-        Factor per step or second. When left out, the one for which noise of nominal size and a wrong start disturb the
-        parameters least, judged by the regressor at rest.
+        Factor per step or second. When left out, the one for which noise and a wrong start of nominal size disturb the
+        parameters least (7.46), under constant regressors of the domain.
     horizon : float, optional
         Steps or seconds from which parameters are to be judged: the shorter, the faster a wrong start has to fade. 200
         times the model's fastest time constant when left out. What is claimed holds for any T.
@@ -258,25 +258,33 @@ def design_excitation(
     T = 200.0 / pace if horizon is None else positive("design_excitation: horizon", horizon)
     samples = increments.at(increments.random(64, np.random.default_rng(2)))
 
-    def attempt(factor: float) -> tuple[float, Any]:
-        value, *found, L = design(units, points, centre, factor, T, compensated=compensated)
-        Phi = centre.A[0] + L @ centre.C[0]
-        seen = regressor(units, Phi, samples.E + L @ samples.F, centre.C[0], samples.F)
-        return value / max(seen, 1e-12), (*found, L)
+    def attempt(factor: float, least: float = SLACKS[0]) -> tuple[float, Any]:
+        noise, wrong, *found, L = design(units, points, centre, factor, T, compensated=compensated, least=least)
+        Phi, G = centre.A[0] + L @ centre.C[0], samples.E + L @ samples.F
+        information, memory = gathered(units, factor, T, Phi, G, centre.C[0], samples.F)
+        return (noise * memory + factor**T * wrong) / max(information, 1e-300), (*found, L)
 
-    try:
-        mu = _best_factor(attempt, pace, units.discrete) if mu is None else float(mu)
-        P, Q, R, L = attempt(mu)[1]
-    except CertificateError as error:
-        raise CertificateError(f"design_excitation: {_why_not(centre, mu, units.discrete, model)}{error}") from None
-    made = ExcitationDesign(
-        increments, frozen(P), frozen(Q), frozen(R), mu, mu, frozen(L),
-        A=frozen(centre.A[0]) if compensated else None, C=frozen(centre.C[0]),
-        Phi=frozen(centre.A[0] + L @ centre.C[0]) if fixed else None,
-        scope="global" if fixed and _follows_one(increments, compensated) else "local", H=None,
-        method=cover.method, rigorous=cover.rigorous, margin=np.nan, worst=(increments.centre,) * 2, notes=notes,
-    )  # fmt: skip
-    made = _verified(made, points)
+    failure, made = None, None
+    for least in SLACKS:
+        try:
+            mu = _best_factor(attempt, pace, units.discrete) if mu is None else float(mu)
+            P, Q, R, L = attempt(mu, least)[1]
+            made = _verified(
+                ExcitationDesign(
+                    increments, frozen(P), frozen(Q), frozen(R), mu, mu, frozen(L),
+                    A=frozen(centre.A[0]) if compensated else None, C=frozen(centre.C[0]),
+                    Phi=frozen(centre.A[0] + L @ centre.C[0]) if fixed else None,
+                    scope="global" if fixed and _follows_one(increments, compensated) else "local", H=None,
+                    method=cover.method, rigorous=cover.rigorous, margin=np.nan, worst=(increments.centre,) * 2,
+                    notes=notes,
+                ), points,
+            )  # fmt: skip
+            break
+        except CertificateError as error:
+            failure = error
+    if made is None:
+        why = _why_not(centre, mu, units.discrete, model)
+        raise CertificateError(f"design_excitation: {why}{failure}") from None
     return made if B_p is None else replace(made, drift=_drift(made, points, B_p))
 
 
@@ -346,7 +354,7 @@ def _verified(made: ExcitationDesign, points: Jacobians) -> ExcitationDesign:
     margin = float(min(at_pairs.min(), made.slack(points).min()))
     if margin < -1e-10:
         raise CertificateError(
-            f"design_excitation: the inequality fails by {-margin:.2g} (nominal units, relative to R) at points that the "
+            f"the inequality fails by {-margin:.2g} (nominal units, relative to R) at points that the "
             f"solver did not see, or by its inaccuracy. Try another mu than {made.mu:.4g}, a smaller domain, or nominal= "
             "nearer to the sizes of the signals"
         )

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag, eigh
+from scipy.linalg import block_diag, eigh, expm, solve_continuous_are, solve_discrete_are
 
 from ctmhe.certificates.increments import Jacobians
 from ctmhe.certificates.lmi import require_cvxpy, solved
 from ctmhe.models.continuous import Model
 from ctmhe.types import Array
 
-SLACK = 1e-6
+SLACKS = (1e-6, 1e-5, 1e-4)
+"""Demanded of the program in its own units; solutions are inaccurate, and one that fails is sought with more."""
+
+FASTEST = 10.0
+"""Continuous time: how much faster than the model itself Phi may be; without noise in y the best gain is infinite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,16 +71,47 @@ def slack(units: Units, mu: float, weights: tuple[Array, Array, Array], L: Array
     return np.linalg.eigvalsh((matrices + matrices.transpose(0, 2, 1)) / 2)[:, 0] / np.trace(units.y @ R @ units.y)
 
 
-def design(
-    units: Units, points: Jacobians, centre: Jacobians, mu: float, horizon: float, *, compensated: bool
-) -> tuple[float, Array, Array, Array, Array]:
-    """Return the value of the program, and P, Q, R, L at the centre, in the model's units.
+def coordinates(units: Units, points: Jacobians, centre: Jacobians, mu: float) -> Array:
+    """Return the basis (nx, nx) of states in which the program is solved: there P is about of size one.
 
-    The value is what noise of nominal size adds to W in steps, and a wrong start of nominal size over the horizon, per
-    nominal |y|^2. `compensated`: L follows A, so that only the part of A that outputs do not see varies in Phi.
+    The square root of what a filter that forgets by mu would take for the covariance, for noise of nominal size, to
+    which the change of A over the domain adds.
+    """
+    A, B, _, C, _, _ = (part[0] for part in units.scaled(centre))
+    change = (units.scaled(points).A - A) @ np.linalg.pinv(C)
+    noise, identity = B @ B.T + (change @ change.transpose(0, 2, 1)).mean(axis=0), np.eye(len(C))
+    noise = noise + 1e-6 * np.trace(noise) * np.eye(len(A))
+    try:
+        if units.discrete:
+            covariance = solve_discrete_are(A.T / np.sqrt(mu), C.T, noise, identity)
+        else:
+            covariance = solve_continuous_are((A - np.log(mu) / 2 * np.eye(len(A))).T, C.T, noise, identity)
+        return units.x @ np.linalg.cholesky(covariance)
+    except (np.linalg.LinAlgError, ValueError):
+        return units.x
+
+
+def design(
+    units: Units,
+    points: Jacobians,
+    centre: Jacobians,
+    mu: float,
+    horizon: float,
+    *,
+    compensated: bool,
+    least: float = SLACKS[0],
+) -> tuple[float, float, Array, Array, Array, Array]:
+    """Return what the program found: two numbers, and P, Q, R, L at the centre in the model's units.
+
+    The numbers, which it makes small together, are what noise of nominal size adds to W per step or second, and what a
+    start that is wrong by nominal states is in it, both per nominal |y|^2. `compensated`: L follows A, so that only the part of A that outputs do not see varies in Phi. `least`:
+    smallest eigenvalue demanded.
     """
     cp = require_cvxpy()
     pace = 1.0 if units.discrete else units.pace(points)  # the program's unit of time: entries of size one
+    basis = coordinates(units, points, centre, mu)
+    start = np.linalg.inv(units.x) @ basis  # of nominal size
+    units = replace(units, x=basis)
     points, centre = units.scaled(points), units.scaled(centre)
     n, nw, ny = points.A.shape[1], points.B.shape[2], points.C.shape[1]
     size = float(np.mean(np.diag(units.y) ** 2))
@@ -85,7 +120,7 @@ def design(
     m = n + nw + ny
     in_z, in_w, in_y = np.split(np.eye(m), [n, n + nw], axis=1)
     inverse, rate = np.linalg.pinv(centre.C[0]), -np.log(mu) / pace
-    constraints: list[Any] = [P >> SLACK * np.eye(n)]
+    constraints: list[Any] = [P >> least * np.eye(n)]
     for A, B, C, D in zip(points.A, points.B, points.C, points.D, strict=True):
         PL = Y - P @ ((A - centre.A[0]) @ inverse / pace) if compensated else Y
         gain = P @ (np.hstack([A, B, np.zeros((n, ny))]) / pace) + PL @ np.hstack([C, D, -np.eye(ny)])
@@ -97,21 +132,36 @@ def design(
         else:
             half = in_z @ gain
             matrix = matrix - rate * (in_z @ P @ in_z.T) - half - half.T
-        constraints.append((matrix + matrix.T) / 2 >> SLACK * np.eye(matrix.shape[0]))
+            constraints.append(gain[:, :n] + gain[:, :n].T >> -2 * FASTEST * P)
+        constraints.append((matrix + matrix.T) / 2 >> least * np.eye(matrix.shape[0]))
+    inside = np.linalg.inv(start)
     left = np.exp(-rate * pace * horizon)
-    cost = cp.trace(R) + (rate * left / (1 - left) + 1e-6) * cp.trace(P) + (cp.trace(Q) if Q is not None else 0.0)
-    value = solved(cp.Problem(cp.Minimize(cost), constraints))
+    noise = cp.trace(R) + (cp.trace(Q) if Q is not None else 0.0)
+    wrong = cp.trace(inside.T @ P @ inside)
+    solved(cp.Problem(cp.Minimize(noise + (rate * left / (1 - left) + 1e-6) * wrong), constraints))
     x, w, y = (np.linalg.inv(part) for part in (units.x, units.w, units.y))
     L = pace * units.x @ np.linalg.solve(P.value, Y.value) @ y
-    weights = (x @ P.value @ x / pace, w @ (Q.value if Q is not None else np.zeros((0, 0))) @ w, y @ R.value @ y)
-    return value, *(size * (part + part.T) / 2 for part in weights), L
+    weights = (x.T @ P.value @ x / pace, w @ (Q.value if Q is not None else np.zeros((0, 0))) @ w, y @ R.value @ y)
+    return float(noise.value), float(wrong.value) / pace, *(size * (part + part.T) / 2 for part in weights), L
 
 
-def regressor(units: Units, Phi: Array, G: Array, C: Array, F: Array) -> float:
-    """Return the mean square of C Y + F at rest for k regressors G, F, in nominal units per nominal |y|^2."""
-    n = len(Phi)
-    rest = np.linalg.solve(np.eye(n) - Phi if units.discrete else -Phi, G)
-    return float(np.mean(np.sum(((C @ rest + F) @ units.p) ** 2, axis=(1, 2))) / np.mean(np.diag(units.y) ** 2))
+def gathered(units: Units, mu: float, horizon: float, Phi: Array, G: Array, C: Array, F: Array) -> tuple[float, float]:
+    """Return the information (7.62) on nominal parameters that k constant regressors G, F gather, on average.
+
+    And how many steps or seconds of constant noise W remembers of the horizon: (1 - mu^T) / (1 - mu).
+    """
+    steps = max(int(horizon), 1) if units.discrete else 200
+    h, n, kept = horizon / steps, len(Phi), mu
+    if not units.discrete:
+        kept = mu**h
+        block = expm(h * np.block([[Phi, np.eye(n)], [np.zeros((n, 2 * n))]]))
+        Phi, G = block[:n, :n], block[:n, n:] @ G
+    Y, total, memory = np.zeros_like(G), 0.0, 0.0
+    for _ in range(min(steps, 5000)):
+        total = kept * total + np.mean(np.sum(((C @ Y + F) @ units.p) ** 2, axis=(1, 2))) * h
+        memory = kept * memory + h
+        Y = Phi @ Y + G
+    return float(total / np.mean(np.diag(units.y) ** 2)), memory
 
 
 def phi_factor(P: Array, Phi: Array, *, discrete: bool = True) -> float:

@@ -2,7 +2,7 @@
 
 from ctmhe.models.library.batch_reactor import batch_reactor
 from ctmhe.models.library.cascaded_tanks import cascaded_tanks
-from ctmhe.models.library.chua import chua
+from ctmhe.models.library.chua import chua, chua_discrete
 from ctmhe.models.library.cstr import cstr, cstr_steady_states
 from ctmhe.models.library.quadrotor import hover_speed, quadrotor
 from ctmhe.models.library.van_der_pol import van_der_pol
@@ -11,6 +11,7 @@ __all__ = [
     "batch_reactor",
     "cascaded_tanks",
     "chua",
+    "chua_discrete",
     "cstr",
     "cstr_steady_states",
     "hover_speed",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ctmhe.models.continuous import ContinuousModel
+from ctmhe.models.discrete import DiscreteModel
 from ctmhe.models.library._parts import Parameters, disturbances
 from ctmhe.types import Bounds
 
@@ -75,5 +76,45 @@ def chua(*, noise: bool = True, parameters: str | Sequence[str] = ("p",)) -> Con
             p=constants.box({"p": (0.2, 0.8)}),
         ),
         name="chua",
+        source="thesis, Section 5.2.4",
+    )
+
+
+def chua_discrete(*, step: float = 0.01, parameters: str | Sequence[str] = ("p",)) -> DiscreteModel:
+    """Return one Euler step of `chua`, with disturbances a step: the joint estimation example of the thesis.
+
+    Parameters
+    ----------
+    step : float
+        Length of a step in seconds.
+    parameters : sequence of str
+        As for `chua`.
+
+    Returns
+    -------
+    DiscreteModel
+        x(k+1) = x + step f(x, p) + (w_x1, w_x2, w_x3), voltage = x1 + v_voltage.
+        Bounds: those of `chua`, |w_x| <= 1e-3, |v_voltage| <= 0.1.
+
+    Source: thesis, Sections 5.2.4 and (with p+ = p + w_4) 5.3.3; paper 000, Section 5 (with |x1| <= 5).
+    """
+    flow = chua(parameters=parameters)
+
+    def f(t, x, u, w, p):
+        return x + step * flow.dynamics(t, x, u, 0, p) + w[:3]
+
+    sizes = dict.fromkeys(flow.w.names[:3], 1e-3) | {"v_voltage": 0.1}
+    return DiscreteModel(
+        f,
+        lambda t, x, u, w, p: x[0] + w[3],
+        step=step,
+        x=STATES,
+        w=flow.w.names,
+        p=flow.p.names,
+        y=OUTPUTS,
+        nominal=dict(zip((*STATES, *OUTPUTS, *flow.p.names), (*flow.x.nominal, *flow.y.nominal, *flow.p.nominal), strict=True)),
+        p_start=flow.p_start,
+        bounds=Bounds(x=flow.bounds.x, w={name: (-size, size) for name, size in sizes.items()}, p=flow.bounds.p),
+        name="chua, Euler",
         source="thesis, Section 5.2.4",
     )
