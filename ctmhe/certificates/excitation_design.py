@@ -29,7 +29,7 @@ import numpy as np
 from scipy.linalg import eigh
 from scipy.optimize import minimize_scalar
 
-from ctmhe.certificates.increments import Cover, Increments, Jacobians
+from ctmhe.certificates.increments import Cover, Increments, Jacobians, constant
 from ctmhe.certificates.injection import SLACKS, Units, design, gathered, least_upper_bound, phi_factor, slack
 from ctmhe.errors import CertificateError, InputError
 from ctmhe.models.continuous import Model
@@ -250,10 +250,10 @@ def design_excitation(
             raise InputError(f"design_excitation: B_p must have shape {expected}, got {B_p.shape}")
     cover, notes = _cover(increments)
     points, centre = cover.jacobians, increments.at(increments.centre)
-    linear = _constant(points.C) and _constant(points.D)
-    compensated = linear and not _constant(points.A)
+    linear = constant(points.C) and constant(points.D)
+    compensated = linear and not constant(points.A)
     unseen = np.eye(len(units.x)) - np.linalg.pinv(centre.C[0]) @ centre.C[0]
-    fixed = linear and _constant(points.A @ unseen)
+    fixed = linear and constant(points.A @ unseen)
     pace = units.pace(centre)
     T = 200.0 / pace if horizon is None else positive("design_excitation: horizon", horizon)
     samples = increments.at(increments.random(64, np.random.default_rng(2)))
@@ -285,22 +285,17 @@ def design_excitation(
     if made is None:
         why = _why_not(centre, mu, units.discrete, model)
         raise CertificateError(f"design_excitation: {why}{failure}") from None
-    return made if B_p is None else replace(made, drift=_drift(made, points, B_p))
+    return made if B_p is None else replace(made, drift=_drift(made, B_p))
 
 
 def _cover(increments: Increments) -> tuple[Cover, tuple[str, ...]]:
     cover = increments.cover("ABCD")
-    if _constant(cover.jacobians.C) and _constant(cover.jacobians.D):
+    if constant(cover.jacobians.C) and constant(cover.jacobians.D):
         return cover, ()
     pairs = increments.between(*increments.random_pairs(100, np.random.default_rng(3)))
     both = Jacobians(*(np.concatenate(parts) for parts in zip(cover.jacobians, pairs, strict=True)))
     note = "outputs are not linear: mean values of their Jacobians over pairs were sampled"
     return Cover(both, "grid", False), (note,)
-
-
-def _constant(parts: Array) -> bool:
-    """Return whether k matrices are the same, to rounding."""
-    return bool(np.ptp(parts, axis=0).max(initial=0.0) <= 1e-11 * np.abs(parts).max(initial=1.0))
 
 
 def _best_factor(attempt: Any, pace: float, discrete: bool) -> float:
@@ -380,26 +375,29 @@ def regressor_bound(made: ExcitationDesign) -> Array | None:
     return frozen(least_upper_bound(seen.transpose(0, 2, 1) @ made.P @ seen, Units.of(made.model).y))
 
 
-def _drift(made: ExcitationDesign, points: Jacobians, B_p: Array) -> Drift:
+def filter_bounds(made: ExcitationDesign) -> tuple[float, float]:
+    """Return bounds of |Y v|_P / |v| and of |S| along every pair that starts with zero: (7.78), best eps3, and (7.85)."""
+    points, other = _cover(made.increments)[0].jacobians, made.increments.cover("EF").jacobians
+    L = made.injection(points.A)
+    forces = (other.E[:, None] + L[None] @ other.F[:, None]).reshape(-1, *other.E.shape[1:])
+    force = np.sqrt(max(np.linalg.eigvalsh(G.T @ made.P @ G)[-1] for G in forces))
+    Y = force / (1 - np.sqrt(made.eta)) if made.discrete else -2 * force / np.log(made.eta)
+    seen = np.sqrt(max(eigh(C.T @ C, made.P, eigvals_only=True)[-1] for C in points.C))
+    feed = max(np.linalg.norm(F, 2) for F in other.F)
+    return float(Y), float((seen * Y + feed) ** 2 / ((1 - made.mu) if made.discrete else -np.log(made.mu)))
+
+
+def _drift(made: ExcitationDesign, B_p: Array) -> Drift:
     """Return what W needs for parameters that vary: thesis 7.2.2, where the proof drops B_p after (7.83).
 
     Y enters by Young's inequality on the whole step: W+ <= (1 + e) W+(constant) + (1 + 1/e) (|Y B_p dw|^2_P +
     |B_p dw|^2_S); in continuous time 2 |z'P Y B_p dw| + 2 |dp'S B_p dw| <= e W + (1/e) (the same).
     """
-    P, mu, discrete, rate = made.P, made.mu, made.discrete, -np.log(made.mu)
-    other, L = made.increments.cover("EF").jacobians, made.injection(points.A)
-    forces = (other.E[:, None] + L[None] @ other.F[:, None]).reshape(-1, *other.E.shape[1:])
-    force = np.sqrt(max(np.linalg.eigvalsh(G.T @ P @ G)[-1] for G in forces))
-    Y = force / (1 - np.sqrt(made.eta)) if discrete else -2 * force / np.log(made.eta)
-    seen = np.sqrt(max(eigh(C.T @ C, P, eigvals_only=True)[-1] for C in points.C))
-    feed = max(np.linalg.norm(F, 2) for F in other.F)
-    S = (seen * Y + feed) ** 2 / ((1 - mu) if discrete else rate)
+    (Y, S), mu, rate = filter_bounds(made), made.mu, -np.log(made.mu)
     added = (Y**2 + S) * B_p.T @ B_p
-    if discrete:
+    if made.discrete:
         contraction = (1 + mu) / 2
         e = contraction / mu - 1
-        Q, R = (1 + e) * made.Q + (1 + 1 / e) * added, (1 + e) * made.R
-    else:
-        e = rate / 2
-        contraction, Q, R = np.exp(e - rate), made.Q + added / e, made.R
-    return Drift(frozen(B_p), float(contraction), frozen(Q), frozen(R), float(Y), float(S))
+        return Drift(frozen(B_p), contraction, frozen((1 + e) * made.Q + (1 + 1 / e) * added), (1 + e) * made.R, Y, S)
+    e = rate / 2
+    return Drift(frozen(B_p), float(np.exp(e - rate)), frozen(made.Q + added / e), made.R, Y, S)

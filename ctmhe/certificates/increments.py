@@ -269,3 +269,8 @@ def _pruned(jacobians: Jacobians, which: str) -> Jacobians:
         except QhullError:
             pass
     return jacobians.take(first[keep])
+
+
+def constant(parts: Array) -> bool:
+    """Return whether k matrices are the same, to rounding."""
+    return bool(np.ptp(parts, axis=0).max(initial=0.0) <= 1e-11 * np.abs(parts).max(initial=1.0))

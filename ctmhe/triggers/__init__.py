@@ -7,7 +7,7 @@ from ctmhe.triggers.covariance import CovarianceBound, CovarianceSelfTriggered
 from ctmhe.triggers.crossing import LevelCrossing
 from ctmhe.triggers.energy import InnovationEnergy
 from ctmhe.triggers.gaps import GeometricGaps, Jittered, LinearGaps, Poisson
-from ctmhe.triggers.information import Excitation, ExcitationMeasure
+from ctmhe.triggers.information import Excitation, ExcitationMeasure, WindowExcitation
 from ctmhe.triggers.innovation import Innovation, Stochastic
 from ctmhe.triggers.loading import build_trigger, load_trigger
 from ctmhe.triggers.phases import During, Phases
@@ -50,6 +50,7 @@ __all__ = [
     "TriggerContext",
     "Watch",
     "WatchState",
+    "WindowExcitation",
     "build_trigger",
     "load_trigger",
     "trigger",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+from ctmhe.certificates.excitation import ExcitationMonitor
 from ctmhe.errors import InputError
 from ctmhe.triggers.base import Trigger, TriggerContext
 from ctmhe.types import finite_time
@@ -22,12 +23,39 @@ class ExcitationMeasure(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class WindowExcitation:
+    """The level alpha_t (7.62) of the last estimate's window, continued to now without disturbance.
+
+    Zero before the first estimate. In y's units squared over p's; see `ExcitationMonitor` for what it promises.
+
+    Parameters
+    ----------
+    monitor : ExcitationMonitor
+        Its model has the estimator's parameters.
+    """
+
+    monitor: ExcitationMonitor
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.monitor, ExcitationMonitor):
+            raise InputError(
+                f"WindowExcitation: expected ExcitationMonitor(design_excitation(model)), got {self.monitor!r}"
+            )
+
+    def __call__(self, ctx: TriggerContext, /) -> float:
+        """Return alpha_t at the time of the context."""
+        if ctx.estimate is None:
+            return 0.0
+        return self.monitor.level(ctx.estimate.trajectory, until=ctx.t)
+
+
 @dataclass(frozen=True, repr=False)
 class Excitation(Trigger):
     """Sample while the parameters are excited: measure(ctx) - level >= 0.
 
     Estimates of parameters improve only with data that depend on them: persistent excitation, as thesis ch. 5 demands
-    of the windows used for them. The measure is the caller's; see `ExcitationMeasure`.
+    of the windows used for them. `WindowExcitation` measures it as thesis 7.2 does; any other measure will do.
 
     Parameters
     ----------
