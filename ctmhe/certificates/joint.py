@@ -10,8 +10,9 @@ from scipy.linalg import block_diag, eigh
 from scipy.optimize import minimize_scalar
 
 from ctmhe.certificates.excitation import ExcitationMonitor
-from ctmhe.certificates.excitation_design import ExcitationDesign, filter_bounds
+from ctmhe.certificates.excitation_design import ExcitationDesign, ExcitedSet, filter_bounds
 from ctmhe.certificates.injection import Units, least_upper_bound
+from ctmhe.certificates.joint_weights import StateDetectability
 from ctmhe.errors import CertificateError, InputError
 from ctmhe.types import Array, DiscountedCost, Trajectory, frozen, positive
 
@@ -175,6 +176,41 @@ def certify_jointly(design: ExcitationDesign, *, alpha: float, S_0: Any = None) 
         horizon = float(np.floor(horizon) + 1)
     parts = (frozen(S_0), frozen(M_0), design.mu, design.Q, design.R, alpha, frozen(M_lower), kappa, float(horizon))
     return JointCertificate(design, *parts)
+
+
+@dataclass(frozen=True, eq=False)
+class JointBound:
+    """lower |(dx, dp)(t)|^2 <= upper eta^t |(dx, dp)(0)|^2 + sum of eta^(j-1) ( |dw(t-j)|^2_Q + |dy(t-j)|^2_R ): (5.69)."""
+
+    lower: float
+    upper: float
+    eta: float
+    Q: Array
+    R: Array
+
+
+def joint_bound(states: StateDetectability, excited: ExcitedSet, *, T: int) -> JointBound:
+    """Return the i-IOSS bound of states and parameters, if all pairs over at least T steps are excited.
+
+    Proposition 5.1, (a) to (b), up to the converse theorem that turns the bound into a Lyapunov function. Discrete time.
+    """
+    eta, sum_x = max(states.eta, excited.eta), 1 / (1 - states.eta) + 1
+    c = sum_x * float(eigh(states.S, excited.S, eigvals_only=True)[-1])
+    largest = [float(np.linalg.eigvalsh(part)[-1]) for part in (states.P_upper + c * excited.P, states.S)]
+    lower = min(float(np.linalg.eigvalsh(part)[0]) for part in (states.P_lower, states.S))
+    upper = max(largest[0], largest[1] * eta ** (1 - T) * sum_x)
+    return JointBound(lower, upper, eta, frozen(states.Q + c * excited.Q), frozen(states.R + c * excited.R))
+
+
+def uniform_excitation(bound: JointBound, *, states: int, parameters: int) -> tuple[int, ExcitedSet]:
+    """Return T, and the matrices of E_K for all K >= T, that a bound on states and parameters implies.
+
+    Proposition 5.1, (b) to (a): joint detectability is uniform excitation. T is twice the shortest possible.
+    """
+    T = 2 * max(int(np.ceil(np.log(bound.lower / bound.upper) / np.log(bound.eta))), 1)
+    left = bound.lower - bound.upper * bound.eta**T
+    S, P = left * np.eye(parameters), bound.upper * np.eye(states)
+    return T, ExcitedSet(frozen(S), frozen(P), bound.Q, bound.R, bound.eta)
 
 
 def young_weights(

@@ -157,6 +157,7 @@ def joint_weights(
     eta_2: float | None = None,
     scale: float | None = None,
     caution: float = 1.0,
+    B_p: Any = None,
 ) -> JointWeights:
     """Return the smallest constant weights that Assumption 5.2 allows: (5.10)-(5.16).
 
@@ -171,6 +172,9 @@ def joint_weights(
         one lengthens the horizon (5.35), a smaller one trusts the model less.
     caution : float >= 1
         V over 2 S_p: how much a parameter counts that was found with enough excitation.
+    B_p : array (np, nw), optional
+        Parameters vary by p+ = p + B_p w, `excited` being made for the horizon: (5.77)-(5.79), where the stage is not
+        discounted and Q_v = B_p' (V / 2) B_p is added to Q.
 
     Raises
     ------
@@ -179,10 +183,10 @@ def joint_weights(
     """
     fade = max(states.eta, excited.eta)
     eta_1 = (1 + fade) / 2 if eta_1 is None else float(eta_1)
-    eta_2 = fade if eta_2 is None else float(eta_2)
+    eta_2 = (fade if B_p is None else 1.0) if eta_2 is None else float(eta_2)
     if not fade < eta_1 < 1:
         raise InputError(f"joint_weights: eta_1 must lie in ({fade:.6g}, 1) (5.11), got {eta_1}")
-    if not fade <= eta_2 < 1:
+    if not (fade <= eta_2 < 1 or (B_p is not None and eta_2 == 1)):
         raise InputError(f"joint_weights: eta_2 must lie in [{fade:.6g}, 1) (5.12), got {eta_2}")
     if not (np.isfinite(caution) and caution >= 1):
         raise InputError(f"joint_weights: caution must be at least 1 (5.14), got {caution}")
@@ -190,7 +194,10 @@ def joint_weights(
         scale = 1 / max(float(eigh(states.S, excited.S, eigvals_only=True)[-1]), 1e-300)
     states = states.scaled(positive("joint_weights: scale", scale))
     ratio = float(eigh(excited.P, states.P_upper, eigvals_only=True)[-1])
-    parts = (2 * states.P_upper, 2 * caution * excited.S, 2 * (states.Q + excited.Q), states.R + excited.R)
+    V, Q = 2 * caution * excited.S, 2 * (states.Q + excited.Q)
+    if B_p is not None:
+        Q = Q + np.transpose(B_p) @ V @ np.asarray(B_p)
+    parts = (2 * states.P_upper, V, Q, states.R + excited.R)
     return JointWeights(*(frozen(part) for part in parts), eta_1, eta_2, states.eta, excited.eta, ratio)
 
 
