@@ -223,11 +223,11 @@ def design_excitation(
     u : box, optional
         Range of the inputs.
     mu : float in (0, 1), optional
-        Factor per step or second. When left out, the one for which noise and a wrong start of nominal size disturb the
-        parameters least (7.46), under constant regressors of the domain.
+        Factor per step or second. When left out, the one with the least of what noise of nominal size makes of the
+        parameters, (7.46) over 1 - 4 mu^T: slow ones average more noise, fast ones contract more over the horizon.
     horizon : float, optional
-        Steps or seconds from which parameters are to be judged: the shorter, the faster a wrong start has to fade. 200
-        times the model's fastest time constant when left out. What is claimed holds for any T.
+        T in steps or seconds, the window from which parameters are to be judged; it decides about `mu` only. 200 times
+        the model's fastest time constant when left out. What is claimed holds for any T.
     B_p : array (np, nw), optional
         Parameters vary: p+ = p + B_p w, or dp/dt = B_p w (7.73b).
 
@@ -259,15 +259,16 @@ def design_excitation(
     samples = increments.at(increments.random(64, np.random.default_rng(2)))
 
     def attempt(factor: float, least: float = SLACKS[0]) -> tuple[float, Any]:
-        noise, wrong, *found, L = design(units, points, centre, factor, T, compensated=compensated, least=least)
+        noise, *found, L = design(units, points, centre, factor, T, compensated=compensated, least=least)
         Phi, G = centre.A[0] + L @ centre.C[0], samples.E + L @ samples.F
         information, memory = gathered(units, factor, T, Phi, G, centre.C[0], samples.F)
-        return (noise * memory + factor**T * wrong) / max(information, 1e-300), (*found, L)
+        contracts = max(1 - 4 * factor**T, 1e-12)
+        return noise * memory / (max(information, 1e-300) * contracts), (*found, L)
 
     failure, made = None, None
     for least in SLACKS:
         try:
-            mu = _best_factor(attempt, pace, units.discrete) if mu is None else float(mu)
+            mu = _best_factor(attempt, 1.1 * np.log(4) / T, min(pace, 4.0) if units.discrete else pace) if mu is None else float(mu)
             P, Q, R, L = attempt(mu, least)[1]
             made = _verified(
                 ExcitationDesign(
@@ -298,10 +299,9 @@ def _cover(increments: Increments) -> tuple[Cover, tuple[str, ...]]:
     return Cover(both, "grid", False), (note,)
 
 
-def _best_factor(attempt: Any, pace: float, discrete: bool) -> float:
-    """Return mu of the least score: a coarse search over rates, then a fine one."""
-    rates = pace * np.logspace(-2.5, 0.5, 8)
-    rates = rates[rates < 4.0] if discrete else rates
+def _best_factor(attempt: Any, slowest: float, fastest: float) -> float:
+    """Return mu of the least score for rates between two: a coarse search, then a fine one."""
+    rates = np.geomspace(slowest, max(fastest, 1.5 * slowest), 6)
 
     def score(log_rate: float) -> float:
         try:
@@ -312,9 +312,9 @@ def _best_factor(attempt: Any, pace: float, discrete: bool) -> float:
     scores = [score(np.log(rate)) for rate in rates]
     best = int(np.argmin(scores))
     if scores[best] >= 1e3:
-        return float(np.exp(-rates[0]))
+        return float(np.exp(-slowest))
     edges = np.log(rates[[max(best - 1, 0), min(best + 1, len(rates) - 1)]])
-    found: Any = minimize_scalar(score, bounds=tuple(edges), method="bounded", options={"maxiter": 8})
+    found: Any = minimize_scalar(score, bounds=tuple(edges), method="bounded", options={"maxiter": 7})
     return float(np.exp(-np.exp(found.x) if found.fun < scores[best] else -rates[best]))
 
 

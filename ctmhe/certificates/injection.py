@@ -100,11 +100,10 @@ def design(
     *,
     compensated: bool,
     least: float = SLACKS[0],
-) -> tuple[float, float, Array, Array, Array, Array]:
-    """Return what the program found: two numbers, and P, Q, R, L at the centre in the model's units.
+) -> tuple[float, Array, Array, Array, Array]:
+    """Return what noise of nominal size adds to W per step or second, per nominal |y|^2, and P, Q, R, L at the centre.
 
-    The numbers, which it makes small together, are what noise of nominal size adds to W per step or second, and what a
-    start that is wrong by nominal states is in it, both per nominal |y|^2. `compensated`: L follows A, so that only the part of A that outputs do not see varies in Phi. `least`:
+    That is made small, together with what a start that is wrong by nominal states leaves in W after the horizon. `compensated`: L follows A, so that only the part of A that outputs do not see varies in Phi. `least`:
     smallest eigenvalue demanded.
     """
     cp = require_cvxpy()
@@ -142,7 +141,7 @@ def design(
     x, w, y = (np.linalg.inv(part) for part in (units.x, units.w, units.y))
     L = pace * units.x @ np.linalg.solve(P.value, Y.value) @ y
     weights = (x.T @ P.value @ x / pace, w @ (Q.value if Q is not None else np.zeros((0, 0))) @ w, y @ R.value @ y)
-    return float(noise.value), float(wrong.value) / pace, *(size * (part + part.T) / 2 for part in weights), L
+    return float(noise.value), *(size * (part + part.T) / 2 for part in weights), L
 
 
 def gathered(units: Units, mu: float, horizon: float, Phi: Array, G: Array, C: Array, F: Array) -> tuple[float, float]:

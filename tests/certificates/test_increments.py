@@ -106,6 +106,4 @@ def test_time_is_refused_with_a_remedy():
 def test_exponential_rates_are_sampled():
     """The stirred tank reactor: Arrhenius terms are no polynomials."""
     model = cstr(parameters=("k0",))
-    increments = Increments(model, Bounds(x=([0.5, 300, 0.5], [1, 350, 0.8])[:2] if len(model.x) == 3 else (0.5, 350),
-                                          p=(7e10, 7.4e10)), u=(0.05, 320))  # fmt: skip
-    assert not increments.cover().rigorous
+    assert not Increments(model, Bounds(x=(0.5, 350.0), p=(7e10, 7.4e10)), u=(0.05, 320.0)).cover().rigorous
