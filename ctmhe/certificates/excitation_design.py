@@ -268,7 +268,11 @@ def design_excitation(
     failure, made = None, None
     for least in SLACKS:
         try:
-            mu = _best_factor(attempt, 1.1 * np.log(4) / T, min(pace, 4.0) if units.discrete else pace) if mu is None else float(mu)
+            mu = (
+                _best_factor(attempt, 1.1 * np.log(4) / T, min(pace, 4.0) if units.discrete else pace)
+                if mu is None
+                else float(mu)
+            )
             P, Q, R, L = attempt(mu, least)[1]
             made = _verified(
                 ExcitationDesign(

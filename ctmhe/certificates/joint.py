@@ -166,7 +166,9 @@ def certify_jointly(design: ExcitationDesign, *, alpha: float, S_0: Any = None) 
         return max(1 / share, largest / rest) if rest > 0 else np.inf
 
     top = alpha / (alpha + size**2)  # where nothing is left for the parameters
-    found: Any = minimize_scalar(lambda s: np.log(min(factor(top * s), 1e300)), bounds=(1e-9, 1 - 1e-9), method="bounded")
+    found: Any = minimize_scalar(
+        lambda s: np.log(min(factor(top * s), 1e300)), bounds=(1e-9, 1 - 1e-9), method="bounded"
+    )
     share = top * float(found.x)
     M_lower = block_diag(share * design.P, (alpha - share / (1 - share) * size**2) * np.eye(o))
     M_0 = block_diag(design.P, S_0)
@@ -213,9 +215,7 @@ def uniform_excitation(bound: JointBound, *, states: int, parameters: int) -> tu
     return T, ExcitedSet(frozen(S), frozen(P), bound.Q, bound.R, bound.eta)
 
 
-def young_weights(
-    design: ExcitationDesign, *, eps1: float, eps2: float, a: float
-) -> tuple[float, Array, Array]:
+def young_weights(design: ExcitationDesign, *, eps1: float, eps2: float, a: float) -> tuple[float, Array, Array]:
     """Return lambda, Q, R that the proofs give for P and L of the design and numbers of one's choice.
 
     Theorem 10 of paper 000 (31)-(32), in which (7.55)-(7.57) of the thesis are eps1 = eps, eps2 = 2, a = gamma; for U, or

@@ -107,7 +107,10 @@ def detect_states(model: Model, domain: Bounds | None = None, *, eta: float, u: 
     except CertificateError as error:
         raise CertificateError(f"detect_states: no quadratic function at eta = {eta:g}: {error}") from None
     x, w, p, y = (np.linalg.inv(part) for part in (basis, units.w, units.p, units.y))
-    Q, S = (np.zeros((0, 0)) if weight is None else unit @ weight.value @ unit for weight, unit in zip(supply, (w, p), strict=True))
+    Q, S = (
+        np.zeros((0, 0)) if weight is None else unit @ weight.value @ unit
+        for weight, unit in zip(supply, (w, p), strict=True)
+    )
     values = (x.T @ P.value @ x, pace * S, pace * Q, pace * y @ R.value @ y)
     weights = tuple(frozen((value + value.T) / 2) for value in values)
     fresh = increments.between(*increments.random_pairs(400, np.random.default_rng(5)))

@@ -31,7 +31,9 @@ def solved(problem: Any) -> float:
             warnings.simplefilter("ignore")  # of inaccurate solutions: every matrix is verified again
             value = problem.solve(solver=cp.CLARABEL)
     except cp.SolverError as error:
-        raise CertificateError(f"the semidefinite program failed ({error}); try a slower rate, or a smaller domain") from None
+        raise CertificateError(
+            f"the semidefinite program failed ({error}); try a slower rate, or a smaller domain"
+        ) from None
     if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
         raise CertificateError(f"the matrix inequality is {problem.status}; try a slower rate, or a smaller domain")
     return float(value)

@@ -101,7 +101,10 @@ def test_parameters_differ_no_more_than_the_set_allows(name, seed):
     else:  # outputs at both ends of a slot under its own w: the trapezoidal rule
         ends = [[np.asarray(made.model.output(0.0, x, u, w, t.p)).ravel() for x, u, w in zip(t.x[1:], t.u0, t.w)]
                 for t in (first, second)]  # fmt: skip
-        left_power, right_power = quadratic(E.R, first.y - second.y), quadratic(E.R, np.array(ends[0]) - np.array(ends[1]))
+        left_power, right_power = (
+            quadratic(E.R, first.y - second.y),
+            quadratic(E.R, np.array(ends[0]) - np.array(ends[1])),
+        )
         fade = E.eta ** (h * (steps - np.arange(steps + 1)))
         supply = h / 2 * (fade[:-1] @ left_power + fade[1:] @ right_power)
         supply += h * fade[1:] @ quadratic(E.Q, first.w - second.w)

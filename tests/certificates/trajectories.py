@@ -21,7 +21,10 @@ def rate(model, x, u, w, p):
 
 def trajectory(model, steps, rng, *, h=None, size=1.0, x=None, p=None, u=None, w=None, B_p=None) -> Trajectory:
     """A trajectory from a random start of the domain, with w of `size` times the domain, held over slots of h."""
-    increments, h = Increments(model, Bounds(**{k: getattr(model.bounds, k) for k in "xwp"}), u=(-1, 1)), model.step or h
+    increments, h = (
+        Increments(model, Bounds(**{k: getattr(model.bounds, k) for k in "xwp"}), u=(-1, 1)),
+        model.step or h,
+    )
     start = increments.random(1, rng)[0]
     x = start[increments.place["x"]] if x is None else np.asarray(x, float)
     p = start[increments.place["p"]] if p is None else np.asarray(p, float)

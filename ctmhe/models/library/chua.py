@@ -112,7 +112,9 @@ def chua_discrete(*, step: float = 0.01, parameters: str | Sequence[str] = ("p",
         w=flow.w.names,
         p=flow.p.names,
         y=OUTPUTS,
-        nominal=dict(zip((*STATES, *OUTPUTS, *flow.p.names), (*flow.x.nominal, *flow.y.nominal, *flow.p.nominal), strict=True)),
+        nominal=dict(
+            zip((*STATES, *OUTPUTS, *flow.p.names), (*flow.x.nominal, *flow.y.nominal, *flow.p.nominal), strict=True)
+        ),
         p_start=flow.p_start,
         bounds=Bounds(x=flow.bounds.x, w={name: (-size, size) for name, size in sizes.items()}, p=flow.bounds.p),
         name="chua, Euler",
