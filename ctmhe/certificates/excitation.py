@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm
 
-from ctmhe.certificates.excitation_design import ExcitationDesign
+from ctmhe.certificates.excited_set import ExcitationDesign
 from ctmhe.certificates.increments import Jacobians
 from ctmhe.errors import InputError
 from ctmhe.types import Array, Trajectory, frozen
@@ -83,7 +83,7 @@ class Information:
 
 @dataclass(frozen=True, eq=False)
 class ExcitationMonitor:
-    """Evaluates the recursion (7.45), (7.69), (7.76) and the sums (7.44), (7.62), (7.69), (7.75), (7.93) on trajectories.
+    """Evaluates the recursion (7.45), (7.69), (7.76) and the sums (7.44), (7.62), (7.75), (7.93) on trajectories.
 
     What the level promises: if that of a pair is at least alpha, `design.excited_set(alpha)` holds for the pair. The
     level of one trajectory, an estimated one, is that of every pair with it where `design.scope` is `global`, and near

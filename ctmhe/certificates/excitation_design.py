@@ -5,13 +5,13 @@ One function carries the proofs of thesis 7.2 and of Theorem 10 of the joint est
     W = |z|^2_P + |dp|^2_S,  z = dx - Y dp,  Y+ = Phi Y + E + L F,  S+ = mu S + (C Y + F)' (C Y + F)
 
 Along every pair of trajectories in the domain W+ <= mu W + |dw|^2_Q + |dy|^2_R. There this follows from (7.41) by
-Young's inequality, with numbers eps, gamma, or a, eps1, eps2, that have to be tuned. Here it is asked for directly. Since
-C Y dp + F dp = dy - C z - D dw, it reads ::
+Young's inequality, with numbers eps, gamma, or a, eps1, eps2, that have to be tuned. Here it is asked for directly.
+Since C Y dp + F dp = dy - C z - D dw, it reads ::
 
     |Phi z + (B + L D) dw - L dy|^2_P + |dy - C z - D dw|^2 <= mu |z|^2_P + |dw|^2_Q + |dy|^2_R
 
-for all z, dw, dy: a linear matrix inequality in (P, P L, Q, R), whose solution is at least as good as the best choice of
-those numbers (gamma = a = 1, since W may be scaled). (7.41) is its part dw = dy = 0. In continuous time, with
+for all z, dw, dy: a linear matrix inequality in (P, P L, Q, R), whose solution is at least as good as the best choice
+of those numbers (gamma = a = 1, since W may be scaled). (7.41) is its part dw = dy = 0. In continuous time, with
 -kappa = ln mu, dY/dt = Phi Y + E + L F, dS/dt = -kappa S + (C Y + F)' (C Y + F),
 
     2 z'P (Phi z + (B + L D) dw - L dy) + |dy - C z - D dw|^2 <= -kappa |z|^2_P + |dw|^2_Q + |dy|^2_R
@@ -22,181 +22,21 @@ for the mean values of every pair if they hold on a hull of the point values.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.linalg import eigh
 from scipy.optimize import minimize_scalar
 
+from ctmhe.certificates.excited_set import Drift, ExcitationDesign
 from ctmhe.certificates.increments import Cover, Increments, Jacobians, constant
-from ctmhe.certificates.injection import SLACKS, Units, design, gathered, least_upper_bound, phi_factor, slack
+from ctmhe.certificates.injection import SLACKS, Units, design, gathered, least_upper_bound, phi_factor
 from ctmhe.errors import CertificateError, InputError
 from ctmhe.models.continuous import Model
 from ctmhe.types import Array, Bounds, frozen, positive
 
 FRESH = 400
-
-
-@dataclass(frozen=True, eq=False)
-class ExcitedSet:
-    """The matrices of E_T (Definitions 5.1 and 5.2): how output differences bound the parameters'.
-
-    For every pair of trajectories over T whose information is at least the level it was made for::
-
-        |dp|^2_S <= eta^T |dx(0)|^2_P + sum of eta^(T-1-j) ( |dw(j)|^2_Q + |dy(j)|^2_R )
-
-    In continuous time the sum is an integral and eta a factor per second. With parameters that vary, dp is their
-    difference at the start and the sum is not discounted (5.75).
-    """
-
-    S: Array
-    P: Array
-    Q: Array
-    R: Array
-    eta: float
-
-
-@dataclass(frozen=True, eq=False)
-class Drift:
-    """W+ <= mu W + |dw|^2_Q + |dy|^2_R for parameters that vary, p+ = p + B_p w (7.73b) or dp/dt = B_p w.
-
-    Attributes
-    ----------
-    B_p : array (np, nw)
-    mu : float
-        Contraction of W; information still fades with the design's own.
-    Q, R : array
-    Y : float
-        |Y v|_P <= Y |v| along every pair: (7.78) with its best eps3.
-    S : float
-        |S| <= S (7.85).
-    """
-
-    B_p: Array
-    mu: float
-    Q: Array
-    R: Array
-    Y: float
-    S: float
-
-
-@dataclass(frozen=True, eq=False)
-class ExcitationDesign:
-    """An injection L(z1, z2) and weights with which excitation can be monitored; made by `design_excitation`.
-
-    Attributes
-    ----------
-    increments : Increments
-        Model and domain.
-    P : array (nx, nx), Q : array (nw, nw), R : array (ny, ny)
-        Of W and its inequality, in y's units squared.
-    mu : float
-        Factor per step, or second, by which W and old information fade.
-    eta : float
-        The smallest for which (7.41) holds with P on the domain; not above mu.
-    L : array (nx, ny)
-        Injection where the mean value of A is `A`.
-    A : array (nx, nx) or None
-        L(z1, z2) = L - (A(z1, z2) - A) C^+ where given; the injection is constant where None.
-    C : array (ny, nx)
-        At the centre of the domain; constant where `A` is given.
-    Phi : array (nx, nx) or None
-        Where it is constant.
-    scope : str
-        `global`: the information of one trajectory is that of every pair with it (Corollary 7.2); `local`: nearly that
-        of pairs near it (Proposition 7.2).
-    H : array (ny, ny) or None
-        Of (7.68), if there is one, from samples. Nothing here rests on it: see `Increments.between`.
-    method : str
-        How the domain was covered, see `Cover`.
-    rigorous : bool
-        Whether that is a proof.
-    margin : float
-        Smallest eigenvalue of the inequality at fresh random pairs and on the cover, in nominal units, over tr R.
-    worst : tuple of two arrays (nv,)
-        The fresh pair (x, u, w, p) with the smallest one.
-    drift : Drift or None
-    notes : tuple of str
-    """
-
-    increments: Increments = field(repr=False)
-    P: Array
-    Q: Array
-    R: Array
-    mu: float
-    eta: float
-    L: Array
-    A: Array | None
-    C: Array
-    Phi: Array | None
-    scope: str
-    H: Array | None
-    method: str
-    rigorous: bool
-    margin: float
-    worst: tuple[Array, Array]
-    drift: Drift | None = None
-    notes: tuple[str, ...] = ()
-
-    @property
-    def model(self) -> Model:
-        """The model."""
-        return self.increments.model
-
-    @property
-    def discrete(self) -> bool:
-        """Whether it counts steps."""
-        return self.model.step is not None
-
-    def injection(self, A: Array) -> Array:
-        """Return L (k, nx, ny) for Jacobians A (k, nx, nx)."""
-        constant = np.broadcast_to(self.L, (len(A), *self.L.shape))
-        return constant if self.A is None else constant - (A - self.A) @ np.linalg.pinv(self.C)
-
-    def recursion(self, jacobians: Jacobians) -> tuple[Array, Array, Array, Array]:
-        """Return Phi, E + L F, C, F of (7.45) at k points or pairs."""
-        A, _, E, C, _, F = jacobians
-        L = self.injection(A)
-        return A + L @ C, E + L @ F, C, F
-
-    def slack(self, jacobians: Jacobians) -> Array:
-        """Return by how much the inequality holds (k,), as in `margin`."""
-        weights = (self.P, self.Q, self.R)
-        return slack(Units.of(self.model), self.mu, weights, self.injection(jacobians.A), jacobians)
-
-    def excited_set(self, alpha: float, *, horizon: float | None = None) -> ExcitedSet:
-        """Return the matrices of E_T for pairs whose information C_T is at least alpha I (7.44), (7.75).
-
-        Parameters
-        ----------
-        alpha : float
-            In y's units squared over p's.
-        horizon : float
-            T, in steps or seconds; only where parameters vary, and always there. The thesis' matrices for that case do
-            not depend on it, but the last step of its proof drops squares: |dp(0)|^2 <= 2 |dp(T)|^2 + 2 T sum of
-            |B_p dw|^2.
-        """
-        alpha = positive("excited_set: alpha", alpha)
-        S = alpha * np.eye(len(self.model.p))
-        drift = self.drift
-        if drift is None:
-            if horizon is not None:
-                raise InputError("excited_set: with constant parameters the matrices do not depend on T; omit horizon")
-            return ExcitedSet(frozen(S), self.P, self.Q, self.R, self.mu)
-        T = positive("excited_set: horizon", horizon, "steps" if self.discrete else "seconds")
-        Q = drift.Q + alpha * T * drift.B_p.T @ drift.B_p
-        return ExcitedSet(frozen(S / 2), self.P, frozen(Q), drift.R, drift.mu)
-
-    def __str__(self) -> str:
-        per = "step" if self.discrete else "second"
-        rows = (
-            f"Excitation of {self.model.name!r}: W fades by mu = {self.mu:.4g} per {per}; (7.41) with {self.eta:.4g}",
-            f"  Phi {'constant' if self.Phi is not None else 'varies'}; from one trajectory: {self.scope}",
-            f"  domain: {self.method}, {'proof' if self.rigorous else 'evidence'}; margin {self.margin:.2g}",
-            *(f"  {note}" for note in self.notes),
-        )
-        return "\n".join(rows)
 
 
 def design_excitation(
@@ -210,8 +50,8 @@ def design_excitation(
 ) -> ExcitationDesign:
     """Find L(z1, z2), P, Q, R with which excitation can be monitored on a domain: thesis (7.40)-(7.41), (7.55)-(7.57).
 
-    Where outputs are linear, L follows A, so that Phi is as constant as they allow. If it is constant, f affine in p and
-    h free of it, the result is global: Corollary 7.2, which also asks for (7.65) and (7.68).
+    Where outputs are linear, L follows A, so that Phi is as constant as they allow. If it is constant, f affine in p
+    and h free of it, the result is global: Corollary 7.2, which also asks for (7.65) and (7.68).
 
     Parameters
     ----------
@@ -280,8 +120,8 @@ def design_excitation(
                     A=frozen(centre.A[0]) if compensated else None, C=frozen(centre.C[0]),
                     Phi=frozen(centre.A[0] + L @ centre.C[0]) if fixed else None,
                     scope="global" if fixed and _follows_one(increments, compensated) else "local", H=None,
-                    method=cover.method, rigorous=cover.rigorous, margin=np.nan, worst=(increments.centre,) * 2,
-                    notes=notes,
+                    method=cover.method, rigorous=cover.rigorous, margin=np.nan, notes=notes,
+                    worst=(increments.centre, increments.centre),
                 ), points,
             )  # fmt: skip
             break
@@ -353,9 +193,9 @@ def _verified(made: ExcitationDesign, points: Jacobians) -> ExcitationDesign:
     margin = float(min(at_pairs.min(), made.slack(points).min()))
     if margin < -1e-10:
         raise CertificateError(
-            f"the inequality fails by {-margin:.2g} (nominal units, relative to R) at points that the "
-            f"solver did not see, or by its inaccuracy. Try another mu than {made.mu:.4g}, a smaller domain, or nominal= "
-            "nearer to the sizes of the signals"
+            f"the inequality fails by {-margin:.2g} (nominal units, relative to R) at points that the solver did not "
+            f"see, or by its inaccuracy. Try another mu than {made.mu:.4g}, a smaller domain, or nominal= nearer to "
+            "the sizes of the signals"
         )
     Phi = np.concatenate([made.recursion(part)[0] for part in (fresh, points)])
     eta = max(phi_factor(made.P, phi, discrete=made.discrete) for phi in Phi)
@@ -380,7 +220,7 @@ def regressor_bound(made: ExcitationDesign) -> Array | None:
 
 
 def filter_bounds(made: ExcitationDesign) -> tuple[float, float]:
-    """Return bounds of |Y v|_P / |v| and of |S| along every pair that starts with zero: (7.78), best eps3, and (7.85)."""
+    """Return bounds of |Y v|_P / |v| and |S| along pairs that start with zero: (7.78) at its best eps3, (7.85)."""
     points, other = _cover(made.increments)[0].jacobians, made.increments.cover("EF").jacobians
     L = made.injection(points.A)
     forces = (other.E[:, None] + L[None] @ other.F[:, None]).reshape(-1, *other.E.shape[1:])

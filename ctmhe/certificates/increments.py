@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from math import comb
 from typing import Any, NamedTuple
@@ -17,9 +18,9 @@ from ctmhe.types import Array, Bounds
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 NODES, WEIGHTS = (NODES + 1) / 2, WEIGHTS / 2  # exact for Jacobians of degree 15 and less
 DEGREE, PIECES, MOST_POINTS, GRID_POINTS = 8, 4, 20_000, 200
-ROUGH = tuple(
-    getattr(ca, f"OP_{name}")
-    for name in "FABS SIGN FLOOR CEIL FMIN FMAX IF_ELSE_ZERO LT LE EQ NE AND OR NOT FMOD COPYSIGN".split()
+ROUGH = (
+    *(ca.OP_FABS, ca.OP_SIGN, ca.OP_FLOOR, ca.OP_CEIL, ca.OP_FMIN, ca.OP_FMAX, ca.OP_FMOD, ca.OP_COPYSIGN),
+    *(ca.OP_IF_ELSE_ZERO, ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_AND, ca.OP_OR, ca.OP_NOT),
 )
 """Instructions that are not analytic: that a derivative vanishes at random points proves nothing of them."""
 
@@ -264,10 +265,8 @@ def _pruned(jacobians: Jacobians, which: str) -> Jacobians:
     elif rank == 1:
         keep = np.array([inner.argmin(), inner.argmax()])
     elif rank <= 4 and len(first) > rank + 1:
-        try:
+        with suppress(QhullError):
             keep = np.sort(ConvexHull(inner).vertices)
-        except QhullError:
-            pass
     return jacobians.take(first[keep])
 
 

@@ -44,7 +44,7 @@ class Units:
 
     def pace(self, jacobians: Jacobians) -> float:
         """Return a rate of the model, per step or second: the largest of A, or of A - I."""
-        A = self.scaled(jacobians).A - (np.eye(len(self.x)) if self.discrete else 0.0)
+        A = np.subtract(self.scaled(jacobians).A, float(self.discrete) * np.eye(len(self.x)))
         return float(np.linalg.norm(A, 2, axis=(1, 2)).max()) or 1.0
 
 
@@ -103,8 +103,9 @@ def design(
 ) -> tuple[float, Array, Array, Array, Array]:
     """Return what noise of nominal size adds to W per step or second, per nominal |y|^2, and P, Q, R, L at the centre.
 
-    That is made small, together with what a start that is wrong by nominal states leaves in W after the horizon. `compensated`: L follows A, so that only the part of A that outputs do not see varies in Phi. `least`:
-    smallest eigenvalue demanded.
+    That is made small, together with what a start that is wrong by nominal states leaves in W after the horizon.
+    `compensated`: L follows A, so that only the part of A that outputs do not see varies in Phi. `least`: smallest
+    eigenvalue demanded.
     """
     cp = require_cvxpy()
     pace = 1.0 if units.discrete else units.pace(points)  # the program's unit of time: entries of size one
@@ -140,8 +141,9 @@ def design(
     solved(cp.Problem(cp.Minimize(noise + (rate * left / (1 - left) + 1e-6) * wrong), constraints))
     x, w, y = (np.linalg.inv(part) for part in (units.x, units.w, units.y))
     L = pace * units.x @ np.linalg.solve(P.value, Y.value) @ y
-    weights = (x.T @ P.value @ x / pace, w @ (Q.value if Q is not None else np.zeros((0, 0))) @ w, y @ R.value @ y)
-    return float(noise.value), *(size * (part + part.T) / 2 for part in weights), L
+    supply = w @ (Q.value if Q is not None else np.zeros((0, 0))) @ w
+    P_, Q_, R_ = (size * (part + part.T) / 2 for part in (x.T @ P.value @ x / pace, supply, y @ R.value @ y))
+    return float(noise.value), P_, Q_, R_, L
 
 
 def gathered(units: Units, mu: float, horizon: float, Phi: Array, G: Array, C: Array, F: Array) -> tuple[float, float]:

@@ -10,7 +10,8 @@ from scipy.linalg import block_diag, eigh
 from scipy.optimize import minimize_scalar
 
 from ctmhe.certificates.excitation import ExcitationMonitor
-from ctmhe.certificates.excitation_design import ExcitationDesign, ExcitedSet, filter_bounds
+from ctmhe.certificates.excitation_design import filter_bounds
+from ctmhe.certificates.excited_set import ExcitationDesign, ExcitedSet
 from ctmhe.certificates.injection import Units, least_upper_bound
 from ctmhe.certificates.joint_weights import StateDetectability
 from ctmhe.errors import CertificateError, InputError
@@ -26,9 +27,9 @@ def lyapunov_matrix(P: Array, Y: Array, S: Array) -> Array:
 class JointCertificate:
     """A joint i-IOSS Lyapunov function U = |(dx, dp)|^2_M(t) for excited pairs: Theorem 10 of paper 000.
 
-    U+ <= eta U + |dw|^2_Q + |dy|^2_R along every pair in the domain; M(t) from (23) with the recursions (18)-(19), which
-    start anew in every window with Y = 0, S = S_0. a, eps1 and eps2 of the paper are found with P, Q, R by one program,
-    see `excitation_design`; lambda = eta is its mu.
+    U+ <= eta U + |dw|^2_Q + |dy|^2_R along every pair in the domain; M(t) from (23) with the recursions (18)-(19),
+    which start anew in every window with Y = 0, S = S_0. a, eps1 and eps2 of the paper are found with P, Q, R by one
+    program, see `excitation_design`; lambda = eta is its mu.
 
     Attributes
     ----------
@@ -182,7 +183,10 @@ def certify_jointly(design: ExcitationDesign, *, alpha: float, S_0: Any = None) 
 
 @dataclass(frozen=True, eq=False)
 class JointBound:
-    """lower |(dx, dp)(t)|^2 <= upper eta^t |(dx, dp)(0)|^2 + sum of eta^(j-1) ( |dw(t-j)|^2_Q + |dy(t-j)|^2_R ): (5.69)."""
+    """lower |e(t)|^2 <= upper eta^t |e(0)|^2 + sum of eta^(j-1) ( |dw(t-j)|^2_Q + |dy(t-j)|^2_R ), with e = (dx, dp).
+
+    Thesis (5.69).
+    """
 
     lower: float
     upper: float
@@ -194,7 +198,7 @@ class JointBound:
 def joint_bound(states: StateDetectability, excited: ExcitedSet, *, T: int) -> JointBound:
     """Return the i-IOSS bound of states and parameters, if all pairs over at least T steps are excited.
 
-    Proposition 5.1, (a) to (b), up to the converse theorem that turns the bound into a Lyapunov function. Discrete time.
+    Proposition 5.1, (a) to (b), up to the converse theorem that makes a Lyapunov function of it. Discrete time.
     """
     eta, sum_x = max(states.eta, excited.eta), 1 / (1 - states.eta) + 1
     c = sum_x * float(eigh(states.S, excited.S, eigvals_only=True)[-1])
@@ -218,9 +222,9 @@ def uniform_excitation(bound: JointBound, *, states: int, parameters: int) -> tu
 def young_weights(design: ExcitationDesign, *, eps1: float, eps2: float, a: float) -> tuple[float, Array, Array]:
     """Return lambda, Q, R that the proofs give for P and L of the design and numbers of one's choice.
 
-    Theorem 10 of paper 000 (31)-(32), in which (7.55)-(7.57) of the thesis are eps1 = eps, eps2 = 2, a = gamma; for U, or
-    W, whose S counts a times. With the mean values of `Increments.between`, so with 2 for 3 in front and without H, and
-    with lambda_max(C'C, P) for |C|^2 / lambda_min(P). For comparison: the design does without them.
+    Theorem 10 of paper 000 (31)-(32), in which (7.55)-(7.57) of the thesis are eps1 = eps, eps2 = 2, a = gamma; for U,
+    or W, whose S counts a times. With the mean values of `Increments.between`, so with 2 for 3 in front and without H,
+    and with lambda_max(C'C, P) for |C|^2 / lambda_min(P). For comparison: the design does without them.
     """
     units, points = Units.of(design.model), design.increments.cover("ABCD").jacobians
     L = design.injection(points.A)
@@ -229,6 +233,5 @@ def young_weights(design: ExcitationDesign, *, eps1: float, eps2: float, a: floa
     push = points.B + L @ points.D
     Q = front * push.transpose(0, 2, 1) @ design.P @ push + rest * points.D.transpose(0, 2, 1) @ points.D
     R = front * L.transpose(0, 2, 1) @ design.P @ L + rest * np.eye(len(design.R))
-    return (1 + eps1) * design.eta + a * (1 + eps2) * seen, *(
-        least_upper_bound(part, unit) for part, unit in ((Q, units.w), (R, units.y))
-    )
+    Q, R = least_upper_bound(Q, units.w), least_upper_bound(R, units.y)
+    return (1 + eps1) * design.eta + a * (1 + eps2) * seen, Q, R

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag, eigh
 
-from ctmhe.certificates.excitation_design import ExcitedSet
+from ctmhe.certificates.excited_set import ExcitedSet
 from ctmhe.certificates.increments import Increments, Jacobians, constant
 from ctmhe.certificates.injection import Units, coordinates
 from ctmhe.certificates.lmi import require_cvxpy, solved
@@ -112,15 +112,15 @@ def detect_states(model: Model, domain: Bounds | None = None, *, eta: float, u: 
         for weight, unit in zip(supply, (w, p), strict=True)
     )
     values = (x.T @ P.value @ x, pace * S, pace * Q, pace * y @ R.value @ y)
-    weights = tuple(frozen((value + value.T) / 2) for value in values)
+    P_, S_, Q_, R_ = (frozen((value + value.T) / 2) for value in values)
     fresh = increments.between(*increments.random_pairs(400, np.random.default_rng(5)))
-    margin = min(detectability_margin(units, eta, weights, part).min() for part in (fresh, parts))
+    margin = min(detectability_margin(units, eta, (P_, S_, Q_, R_), part).min() for part in (fresh, parts))
     if margin < -1e-9:
         raise CertificateError(
-            f"detect_states: (5.5) fails by {-margin:.2g} in nominal units at points that the solver did not see; try a "
-            "slower rate or a smaller domain"
+            f"detect_states: (5.5) fails by {-margin:.2g} in nominal units at points that the solver did not see; try "
+            "a slower rate or a smaller domain"
         )
-    return StateDetectability(weights[0], *weights, eta, method=method, rigorous=rigorous, margin=float(margin))
+    return StateDetectability(P_, P_, S_, Q_, R_, eta, method=method, rigorous=rigorous, margin=float(margin))
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,8 +200,8 @@ def joint_weights(
     V, Q = 2 * caution * excited.S, 2 * (states.Q + excited.Q)
     if B_p is not None:
         Q = Q + np.transpose(B_p) @ V @ np.asarray(B_p)
-    parts = (2 * states.P_upper, V, Q, states.R + excited.R)
-    return JointWeights(*(frozen(part) for part in parts), eta_1, eta_2, states.eta, excited.eta, ratio)
+    W, R = 2 * states.P_upper, states.R + excited.R
+    return JointWeights(frozen(W), frozen(V), frozen(Q), frozen(R), eta_1, eta_2, states.eta, excited.eta, ratio)
 
 
 def unmet(weights: JointWeights, states: StateDetectability, excited: ExcitedSet) -> tuple[str, ...]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-from ctmhe.certificates.excitation import ExcitationMonitor
 from ctmhe.errors import InputError
 from ctmhe.triggers.base import Trigger, TriggerContext
 from ctmhe.types import finite_time
+
+if TYPE_CHECKING:
+    from ctmhe.certificates.excitation import ExcitationMonitor
 
 
 class ExcitationMeasure(Protocol):
@@ -38,6 +40,8 @@ class WindowExcitation:
     monitor: ExcitationMonitor
 
     def __post_init__(self) -> None:
+        from ctmhe.certificates.excitation import ExcitationMonitor  # with parts of SciPy that no other policy needs
+
         if not isinstance(self.monitor, ExcitationMonitor):
             raise InputError(
                 f"WindowExcitation: expected ExcitationMonitor(design_excitation(model)), got {self.monitor!r}"

@@ -99,8 +99,10 @@ def test_parameters_differ_no_more_than_the_set_allows(name, seed):
         supply = fade @ (quadratic(E.Q, first.w - second.w) + quadratic(E.R, first.y - second.y))
         right, slack = E.eta**steps * quadratic(E.P, first.x[0] - second.x[0])[0] + supply, 1e-9
     else:  # outputs at both ends of a slot under its own w: the trapezoidal rule
-        ends = [[np.asarray(made.model.output(0.0, x, u, w, t.p)).ravel() for x, u, w in zip(t.x[1:], t.u0, t.w)]
-                for t in (first, second)]  # fmt: skip
+        ends = []
+        for t in (first, second):
+            rows = zip(t.x[1:], t.u0, t.w, strict=True)
+            ends.append([np.asarray(made.model.output(0.0, x, u, w, t.p)).ravel() for x, u, w in rows])
         left_power, right_power = (
             quadratic(E.R, first.y - second.y),
             quadratic(E.R, np.array(ends[0]) - np.array(ends[1])),

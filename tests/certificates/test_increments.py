@@ -13,7 +13,6 @@ from ctmhe.errors import InputError
 from ctmhe.models import ContinuousModel
 from ctmhe.models.library import chua, chua_discrete, cstr, van_der_pol
 from ctmhe.types import Bounds
-
 from tests.certificates.trajectories import decay, mixer
 
 settings.register_profile("certificates", deadline=None, max_examples=40)
@@ -70,7 +69,7 @@ def test_no_point_lies_outside_a_rigorous_hull(name, which, seed):
 
 
 def test_the_method_is_named_and_a_grid_is_no_proof():
-    """Constant, multi-affine, polynomial; anything else is sampled and says so, and what is not smooth is not trusted."""
+    """Constant, multi-affine, polynomial; anything else is sampled and says so; kinks are not trusted."""
     linear = one("linear", lambda t, x, u, w, p: (x[1], -x[0] + p[0]))
     bilinear = one("bilinear", lambda t, x, u, w, p: (x[1], -p[0] * x[0]), x=(-1, 1), p=(1, 2))
     cubic = one("cubic", lambda t, x, u, w, p: (x[1], -p[0] * x[0] ** 3), x=(-1, 1), p=(1, 2))

@@ -13,7 +13,8 @@ from scipy.linalg import eigh
 
 from ctmhe import MHE, Measurement
 from ctmhe.certificates.excitation import ExcitationMonitor
-from ctmhe.certificates.excitation_design import ExcitedSet, design_excitation
+from ctmhe.certificates.excitation_design import design_excitation
+from ctmhe.certificates.excited_set import ExcitedSet
 from ctmhe.certificates.increments import Increments
 from ctmhe.certificates.injection import Units
 from ctmhe.certificates.joint import (
