@@ -59,7 +59,7 @@ def slack(units: Units, mu: float, weights: tuple[Array, Array, Array], L: Array
     identity = np.broadcast_to(np.eye(len(R)), (len(A), *R.shape))
     gain = np.concatenate([A + L @ C, B + L @ D, -L], axis=2)
     seen = np.concatenate([-C, -D, identity], axis=2)
-    left = seen.transpose(0, 2, 1) @ seen
+    left: Array = np.matmul(seen.transpose(0, 2, 1), seen)
     if units.discrete:
         left = left + gain.transpose(0, 2, 1) @ P @ gain
     else:

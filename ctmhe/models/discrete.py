@@ -27,5 +27,5 @@ class DiscreteModel(ContinuousModel):
     def __init__(self, f: Callable[..., Any], h: Callable[..., Any], *, step: float, **signals: Any):
         if not (np.isfinite(step) and step > 0):
             raise InputError(f"DiscreteModel: step must be a positive number of seconds, got {step}")
-        self.step = float(step)
+        self.step: float | None = float(step)
         super().__init__(f, h, **signals)
