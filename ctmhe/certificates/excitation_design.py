@@ -92,7 +92,7 @@ def design_excitation(
     points, centre = cover.jacobians, increments.at(increments.centre)
     linear = constant(points.C) and constant(points.D)
     compensated = linear and not constant(points.A)
-    unseen = np.eye(len(units.x)) - np.linalg.pinv(centre.C[0]) @ centre.C[0]
+    unseen = np.eye(len(units.x)) - units.right_inverse(centre.C[0]) @ centre.C[0]
     fixed = linear and constant(points.A @ unseen)
     pace = units.pace(centre)
     T = 200.0 / pace if horizon is None else positive("design_excitation: horizon", horizon)
@@ -106,31 +106,32 @@ def design_excitation(
         return noise * memory / (max(information, 1e-300) * contracts), (*found, L)
 
     failure, made = None, None
-    for least in SLACKS:
+    for round_, least in enumerate(SLACKS):
         try:
-            mu = (
-                _best_factor(attempt, 1.1 * np.log(4) / T, min(pace, 4.0) if units.discrete else pace)
-                if mu is None
-                else float(mu)
-            )
+            if mu is None:
+                mu = _best_factor(attempt, 1.1 * np.log(4) / T, min(pace, 4.0) if units.discrete else pace)
             P, Q, R, L = attempt(mu, least)[1]
-            made = _verified(
-                ExcitationDesign(
-                    increments, frozen(P), frozen(Q), frozen(R), mu, mu, frozen(L),
-                    A=frozen(centre.A[0]) if compensated else None, C=frozen(centre.C[0]),
-                    Phi=frozen(centre.A[0] + L @ centre.C[0]) if fixed else None,
-                    scope="global" if fixed and _follows_one(increments, compensated) else "local", H=None,
-                    method=cover.method, rigorous=cover.rigorous, margin=np.nan, notes=notes,
-                    worst=(increments.centre, increments.centre),
-                ), points,
+            made = ExcitationDesign(
+                increments, frozen(P), frozen(Q), frozen(R), float(mu), float(mu), frozen(L),
+                A=frozen(centre.A[0]) if compensated else None, C=frozen(centre.C[0]),
+                Phi=frozen(centre.A[0] + L @ centre.C[0]) if fixed else None,
+                scope="global" if fixed and _follows_one(increments, compensated) else "local", H=None,
+                method=cover.method, rigorous=cover.rigorous, margin=np.nan, notes=notes,
+                worst=(increments.centre, increments.centre),
             )  # fmt: skip
-            break
+            made, met = _verified(made, points, round_)
+            if made.margin >= -1e-10:
+                return made if B_p is None else replace(made, drift=_drift(made, B_p))
+            failure = (
+                f"the inequality fails by {-made.margin:.2g} (nominal units, over R) at points that the solver did not "
+                f"see, or by its inaccuracy. Try another mu than {mu:.4g}, a smaller domain, or nominal= nearer to the "
+                "sizes of the signals"
+            )
+            if not cover.rigorous:  # samples are refined where they were too few
+                points = Jacobians(*(np.concatenate(parts) for parts in zip(points, met, strict=True)))
         except CertificateError as error:
             failure = error
-    if made is None:
-        why = _why_not(centre, mu, units.discrete, model)
-        raise CertificateError(f"design_excitation: {why}{failure}") from None
-    return made if B_p is None else replace(made, drift=_drift(made, B_p))
+    raise CertificateError(f"design_excitation: {_why_not(centre, mu, units.discrete, model)}{failure}")
 
 
 def _cover(increments: Increments) -> tuple[Cover, tuple[str, ...]]:
@@ -185,22 +186,20 @@ def _follows_one(increments: Increments, compensated: bool) -> bool:
     return bool(same and not (compensated and here.F.any()))
 
 
-def _verified(made: ExcitationDesign, points: Jacobians) -> ExcitationDesign:
-    """Return the design with what fresh pairs say of it: margin, eta, H."""
-    v1, v2 = made.increments.random_pairs(FRESH, np.random.default_rng(5))
-    fresh = made.increments.between(v1, v2)
+def _verified(made: ExcitationDesign, points: Jacobians, round_: int) -> tuple[ExcitationDesign, Jacobians]:
+    """Return the design with what fresh pairs say of it (margin, eta, H), and the worst of these."""
+    increments = made.increments
+    v1, v2 = increments.random_pairs(FRESH, np.random.default_rng([5, round_]))
+    corners = increments.corners()
+    v1, v2 = np.vstack([v1, corners]), np.vstack([v2, corners])
+    fresh = increments.between(v1, v2)
     at_pairs = made.slack(fresh)
-    margin = float(min(at_pairs.min(), made.slack(points).min()))
-    if margin < -1e-10:
-        raise CertificateError(
-            f"the inequality fails by {-margin:.2g} (nominal units, relative to R) at points that the solver did not "
-            f"see, or by its inaccuracy. Try another mu than {made.mu:.4g}, a smaller domain, or nominal= nearer to "
-            "the sizes of the signals"
-        )
+    order = np.argsort(at_pairs)
     Phi = np.concatenate([made.recursion(part)[0] for part in (fresh, points)])
     eta = max(phi_factor(made.P, phi, discrete=made.discrete) for phi in Phi)
-    worst = int(at_pairs.argmin())
-    return replace(made, margin=margin, worst=(frozen(v1[worst]), frozen(v2[worst])), eta=eta, H=regressor_bound(made))
+    margin = float(min(at_pairs.min(), made.slack(points).min()))
+    worst = (frozen(v1[order[0]]), frozen(v2[order[0]]))
+    return replace(made, margin=margin, worst=worst, eta=eta, H=regressor_bound(made)), fresh.take(order[:20])
 
 
 def regressor_bound(made: ExcitationDesign) -> Array | None:
@@ -210,7 +209,7 @@ def regressor_bound(made: ExcitationDesign) -> Array | None:
     zero, double = v.copy(), v.copy()
     zero[:, place], double[:, place] = 0.0, 2 * v[:, place]
     here, none, twice = (increments.at(points) for points in (v, zero, double))
-    change, inverse = here.A - none.A, np.linalg.pinv(made.C)
+    change, inverse = here.A - none.A, Units.of(made.model).right_inverse(made.C)
     hidden = np.abs(change - change @ inverse @ made.C).max(initial=0.0)
     affine = np.allclose(twice.A - none.A, 2 * change) and not here.F.any() and np.allclose(here.C, made.C)
     if not affine or hidden > 1e-9 * np.abs(change).max(initial=1e-300):

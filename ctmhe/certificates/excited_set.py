@@ -73,7 +73,7 @@ class ExcitationDesign:
     L : array (nx, ny)
         Injection where the mean value of A is `A`.
     A : array (nx, nx) or None
-        L(z1, z2) = L - (A(z1, z2) - A) C^+ where given; the injection is constant where None.
+        L(z1, z2) = L - (A(z1, z2) - A) C^+ where given (C^+ in nominal units); the injection is constant where None.
     C : array (ny, nx)
         At the centre of the domain; constant where `A` is given.
     Phi : array (nx, nx) or None
@@ -127,7 +127,7 @@ class ExcitationDesign:
     def injection(self, A: Array) -> Array:
         """Return L (k, nx, ny) for Jacobians A (k, nx, nx)."""
         constant = np.broadcast_to(self.L, (len(A), *self.L.shape))
-        return constant if self.A is None else constant - (A - self.A) @ np.linalg.pinv(self.C)
+        return constant if self.A is None else constant - (A - self.A) @ Units.of(self.model).right_inverse(self.C)
 
     def recursion(self, jacobians: Jacobians) -> tuple[Array, Array, Array, Array]:
         """Return Phi, E + L F, C, F of (7.45) at k points or pairs."""

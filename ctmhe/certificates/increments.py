@@ -17,7 +17,7 @@ from ctmhe.types import Array, Bounds
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 NODES, WEIGHTS = (NODES + 1) / 2, WEIGHTS / 2  # exact for Jacobians of degree 15 and less
-DEGREE, PIECES, MOST_POINTS, GRID_POINTS = 8, 4, 20_000, 200
+DEGREE, PIECES, MOST_POINTS, GRID_POINTS, KEPT = 8, 4, 20_000, 400, 40
 ROUGH = (
     *(ca.OP_FABS, ca.OP_SIGN, ca.OP_FLOOR, ca.OP_CEIL, ca.OP_FMIN, ca.OP_FMAX, ca.OP_FMOD, ca.OP_COPYSIGN),
     *(ca.OP_IF_ELSE_ZERO, ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_AND, ca.OP_OR, ca.OP_NOT),
@@ -207,7 +207,8 @@ class Increments:
 
     def _grid(self, which: str) -> Cover:
         samples = self.random(GRID_POINTS, np.random.default_rng(0))
-        return Cover(_pruned(self.at(np.vstack([samples, self.corners()])), which), "grid", False)
+        found = _pruned(self.at(np.vstack([samples, self.corners()])), which)
+        return Cover(_farthest(found, which), "grid", False)
 
     def _coefficients(self, degrees: np.ndarray) -> Jacobians:
         """Return the Bernstein coefficients of all pieces of the box."""
@@ -268,6 +269,14 @@ def _pruned(jacobians: Jacobians, which: str) -> Jacobians:
         with suppress(QhullError):
             keep = np.sort(ConvexHull(inner).vertices)
     return jacobians.take(first[keep])
+
+
+def _farthest(jacobians: Jacobians, which: str) -> Jacobians:
+    """Return those that are farthest out in random directions, a few dozen: of samples, what a program has to see."""
+    flat = np.concatenate([getattr(jacobians, letter).reshape(len(jacobians.A), -1) for letter in which], axis=1)
+    flat = (flat - flat.mean(axis=0)) / np.maximum(np.ptp(flat, axis=0), 1e-300)
+    directions = np.random.default_rng(0).normal(size=(flat.shape[1], KEPT))
+    return jacobians.take(np.unique((flat @ directions).argmax(axis=0)))
 
 
 def constant(parts: Array) -> bool:

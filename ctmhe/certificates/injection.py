@@ -13,10 +13,10 @@ from ctmhe.certificates.lmi import require_cvxpy, solved
 from ctmhe.models.continuous import Model
 from ctmhe.types import Array
 
-SLACKS = (1e-6, 1e-5, 1e-4)
+SLACKS = (1e-7, 1e-6, 1e-6, 1e-5, 1e-5)
 """Demanded of the program in its own units; solutions are inaccurate, and one that fails is sought with more."""
 
-FASTEST = 10.0
+FASTEST = 3.0
 """Continuous time: how much faster than the model itself Phi may be; without noise in y the best gain is infinite."""
 
 
@@ -41,6 +41,10 @@ class Units:
         x, y = np.linalg.inv(self.x), np.linalg.inv(self.y)
         rows, columns = (x, x, x, y, y, y), (self.x, self.w, self.p) * 2
         return Jacobians(*(r @ part @ c for r, part, c in zip(rows, jacobians, columns, strict=True)))
+
+    def right_inverse(self, C: Array) -> Array:
+        """Return C^+ (nx, ny), the pseudo-inverse between signals divided by their nominals."""
+        return self.x @ np.linalg.pinv(np.linalg.inv(self.y) @ C @ self.x) @ np.linalg.inv(self.y)
 
     def pace(self, jacobians: Jacobians) -> float:
         """Return a rate of the model, per step or second: the largest of A, or of A - I."""
@@ -111,6 +115,7 @@ def design(
     pace = 1.0 if units.discrete else units.pace(points)  # the program's unit of time: entries of size one
     basis = coordinates(units, points, centre, mu)
     start = np.linalg.inv(units.x) @ basis  # of nominal size
+    inverse = np.linalg.inv(basis) @ units.right_inverse(centre.C[0]) @ units.y
     units = replace(units, x=basis)
     points, centre = units.scaled(points), units.scaled(centre)
     n, nw, ny = points.A.shape[1], points.B.shape[2], points.C.shape[1]
@@ -119,7 +124,7 @@ def design(
     Q = cp.Variable((nw, nw), symmetric=True) if nw else None
     m = n + nw + ny
     in_z, in_w, in_y = np.split(np.eye(m), [n, n + nw], axis=1)
-    inverse, rate = np.linalg.pinv(centre.C[0]), -np.log(mu) / pace
+    rate = -np.log(mu) / pace
     constraints: list[Any] = [P >> least * np.eye(n)]
     for A, B, C, D in zip(points.A, points.B, points.C, points.D, strict=True):
         PL = Y - P @ ((A - centre.A[0]) @ inverse / pace) if compensated else Y
@@ -132,7 +137,7 @@ def design(
         else:
             half = in_z @ gain
             matrix = matrix - rate * (in_z @ P @ in_z.T) - half - half.T
-            constraints.append(gain[:, :n] + gain[:, :n].T >> -2 * FASTEST * P)
+            constraints.append(gain[:, :n] + gain[:, :n].T >> -2 * max(FASTEST, 3 * rate) * P)
         constraints.append((matrix + matrix.T) / 2 >> least * np.eye(matrix.shape[0]))
     inside = np.linalg.inv(start)
     left = np.exp(-rate * pace * horizon)

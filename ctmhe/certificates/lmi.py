@@ -30,9 +30,10 @@ def solved(problem: Any) -> float:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of inaccurate solutions: every matrix is verified again
             value = problem.solve(solver=cp.CLARABEL)
-    except cp.SolverError as error:
+    except cp.SolverError:
         raise CertificateError(
-            f"the semidefinite program failed ({error}); try a slower rate, or a smaller domain"
+            "the semidefinite program could not be solved: it is infeasible or badly scaled. Try a slower rate, a "
+            "smaller domain, or nominal= nearer to the sizes of the signals"
         ) from None
     if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
         raise CertificateError(f"the matrix inequality is {problem.status}; try a slower rate, or a smaller domain")

@@ -10,12 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
+from ctmhe import FmuModel
 from ctmhe.certificates.excitation import ExcitationMonitor
 from ctmhe.certificates.excitation_design import design_excitation, filter_bounds
 from ctmhe.certificates.injection import least_upper_bound, phi_factor
 from ctmhe.errors import CertificateError, InputError
 from ctmhe.models import ContinuousModel, DiscreteModel
-from ctmhe.models.library import chua, chua_discrete
+from ctmhe.models.library import batch_reactor, chua, chua_discrete
 from ctmhe.types import Bounds
 from tests.certificates.trajectories import decay, mixer, quadratic, rate, trajectory
 
@@ -28,7 +29,11 @@ B_P = {"chua_discrete": np.array([[0.0, 0.0, 1.0, 0.0]]), "decay": np.array([[0.
 @cache
 def design(name: str, mu: float = 0.8, drift: bool = False):
     """One design a model."""
-    model = {"chua": chua, "chua_discrete": chua_discrete, "mixer": mixer, "decay": decay, "scaled": scaled}[name]()
+    made = {"chua": chua, "chua_discrete": chua_discrete, "mixer": mixer, "decay": decay, "scaled": scaled}
+    if name == "reactor":  # the sum of two states is seen: what is unseen is no coordinate, and varies
+        rates = {"k1": (0.1, 0.25), "k2": (0.3, 1.0)}
+        return design_excitation(batch_reactor(parameters=rates), Bounds(x=(0.1, 5), w=(-0.1, 0.1), p=rates), mu=0.4)
+    model = made[name]()
     return design_excitation(model, u=(-1, 1), mu=mu, B_p=B_P[name] if drift else None)
 
 
@@ -42,7 +47,7 @@ def scaled() -> DiscreteModel:
     )  # fmt: skip
 
 
-NAMES = ["chua", "chua_discrete", "mixer", "decay", "scaled"]
+NAMES = ["chua", "chua_discrete", "mixer", "decay", "scaled", "reactor"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -148,6 +153,7 @@ def test_scope_method_and_phi_are_told():
     for name in ("chua", "chua_discrete", "mixer", "decay"):
         made = design(name)
         assert (made.scope, made.rigorous, made.Phi is None) == ("global", True, False), name
+    assert (design("reactor").scope, design("reactor").rigorous, design("reactor").Phi) == ("local", True, None)
     made = design("scaled")
     assert (made.scope, made.rigorous, made.method, made.Phi) == ("local", False, "grid", None)
     assert "evidence" in str(made) and "outputs are not linear" in str(made)
@@ -231,6 +237,18 @@ def test_the_least_upper_bound_is_above_all(seed, n):
     matrices = roots @ roots.transpose(0, 2, 1)
     H = least_upper_bound(matrices, np.eye(n))
     assert np.linalg.eigvalsh(H - matrices).min() >= -1e-9 * np.abs(H).max()
+
+
+def test_an_fmu_gives_the_design_of_its_equations_as_evidence():
+    """Jacobians of the reactor as an FMU: the same domain and rate give the same P, from samples."""
+    build = pytest.importorskip("fmus.build").build
+    rates = {"k1": (0.1, 0.25)}
+    domain = Bounds(x=(0.1, 5), w=(-0.1, 0.1), p=rates)
+    fmu = FmuModel(build("batch_reactor", fmi=2), inputs=[], parameters=["k1"])
+    own = design_excitation(batch_reactor(parameters=("k1",), noise=False), domain, mu=0.4)
+    found = design_excitation(fmu, Bounds(x=(0.1, 5), p=rates), mu=0.4)
+    assert own.rigorous and not found.rigorous and found.method == "grid"
+    assert found.margin >= 0 and found.R.shape == own.R.shape
 
 
 def test_bad_requests_are_explained():

@@ -146,10 +146,10 @@ def row() -> dict[str, Any]:
 
 COMMENT = (
     "No L meets (7.41) at 0.71 with the printed P: on what outputs do not show, eta is P's alone, and at least 0.794. "
-    "A P within its rounding reaches 0.709, and mu = 0.747 by (7.55) asks for a smallest eigenvalue of 1.0e-3 where the "
-    "printed P has 2.0e-3: the print lost digits, not the proof. Its Q_p and R_p meet (7.56)-(7.57) at 0.794 with room. "
-    "The printed P_x fails (5.5) by 2.1e-3 (nominal units) at the edge of the domain; some P_x within its rounding holds "
-    "on all of it. Our design at the same mu asks 9.5 of R per unit of S where the print asks 6e8 (R_p / gamma): one "
-    "matrix inequality for all of W, instead of Young's inequality with eps = 0.01 and gamma = 1e-5. Both measure "
+    "A P within its rounding reaches 0.709, and mu = 0.747 by (7.55) asks for a smallest eigenvalue of 1.0e-3 where "
+    "the printed P has 2.0e-3: the print lost digits, not the proof. Its Q_p and R_p meet (7.56)-(7.57) at 0.794 with "
+    "room. The printed P_x fails (5.5) by 2.1e-3 (nominal units) at the edge of the domain; a P_x within its rounding "
+    "holds on all of it. Our design at the same mu asks 9.5 of R per unit of S where the print asks 6e8 (R_p / gamma): "
+    "one matrix inequality for all of W, instead of Young's inequality with eps = 0.01 and gamma = 1e-5. Both measure "
     "information with their own Phi; from x = (1, 0, -1) over 150 steps the levels differ by a factor below three."
 )
