@@ -217,6 +217,35 @@ class DiscountedCost:
         object.__setattr__(self, "prior_eta", float(prior_eta))
         object.__setattr__(self, "rate", float(-np.log(eta)))
 
+    @classmethod
+    def from_certificate(cls, certificate: Certified) -> DiscountedCost:
+        """Return the cost 2 P_upper, 2 Q, R, eta with which the certificate's guarantee holds (thesis 3.2.2)."""
+        return cls(P=2 * certificate.P_upper, Q=2 * certificate.Q, R=certificate.R, eta=certificate.eta)
+
+
+class Certified(Protocol):
+    """The matrices and the discount of a `DetectabilityCertificate`."""
+
+    @property
+    def P_upper(self) -> Array:
+        """Upper bound of U (nx, nx)."""
+        ...
+
+    @property
+    def Q(self) -> Array:
+        """Weight of disturbances (nw, nw)."""
+        ...
+
+    @property
+    def R(self) -> Array:
+        """Weight of outputs (ny, ny)."""
+        ...
+
+    @property
+    def eta(self) -> float:
+        """Discount per second, or step."""
+        ...
+
 
 class Outcome(Enum):
     """How an estimate came about; the value says what to do about it."""
