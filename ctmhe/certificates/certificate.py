@@ -24,9 +24,9 @@ def largest_ratio(A: Array, B: Array) -> float:
 class DetectabilityCertificate:
     """An i-iIOSS Lyapunov function U with quadratic bounds: exponential detectability, Assumption 3.1 of the thesis.
 
-    For every two trajectories in the domain with the same known inputs, |dx|^2_P_lower <= U <= |dx|^2_P_upper (3.9a) and
-    dU/dt <= ln(eta) U + |dw|^2_Q + |dy|^2_R (3.9b); in discrete time U+ <= eta U + |dw|^2_Q + |dy|^2_R. With the weights
-    2 P_upper, 2 Q, R (`DiscountedCost.from_certificate`) the estimation error is bounded: Theorem 3.1.
+    For any two trajectories in the domain with the same known inputs, |dx|^2_P_lower <= U <= |dx|^2_P_upper (3.9a), and
+    dU/dt <= ln(eta) U + |dw|^2_Q + |dy|^2_R (3.9b); in discrete time U+ <= eta U + |dw|^2_Q + |dy|^2_R. With the cost
+    `DiscountedCost.from_certificate`, of weights 2 P_upper, 2 Q, R, the estimation error is bounded: Theorem 3.1.
 
     Parameters
     ----------

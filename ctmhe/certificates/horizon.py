@@ -1,7 +1,7 @@
 """Horizon, rate and longest wait that a certificate guarantees: thesis (3.29)-(3.31), Remark 3.7, discrete time.
 
-All of them weigh one number, `ratio` = lambda_max(P_upper, P_lower): by (3.20) a window multiplies the error, measured by
-U, by at most 4 ratio eta^T. Times are in seconds and eta per second; in discrete time both count steps, and the wait is
+They need one number of U, `ratio` = lambda_max(P_upper, P_lower): by (3.20) a window multiplies the error, measured
+by U, by at most 4 ratio eta^T. Times are in seconds and eta per second; in discrete time both count steps, and the wait is
 zero, since every window starts and ends at an estimate (Remark 3.7).
 """
 
@@ -32,7 +32,7 @@ def shortest_horizon(ratio: float, eta: float, *, wait: float = 0.0) -> float:
 
 
 def longest_wait(ratio: float, eta: float, *, horizon: float) -> float:
-    """Return the limit that delta_bar has to stay below with this horizon (3.29); negative: the horizon is too short."""
+    """Return the limit that delta_bar has to stay below with this horizon (3.29); if negative, T is too short."""
     return float(horizon) - shortest_horizon(ratio, eta)
 
 
