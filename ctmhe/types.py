@@ -340,6 +340,54 @@ class SolvedWindow(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class ErrorBound:
+    """What is guaranteed of an estimate's error, in the norm of the certificate's P_lower.
+
+    Attributes
+    ----------
+    level : float or None
+        Bound of U(x_hat, x) from this window and the ones before it: (3.20) with the cost that was found (3.25).
+    theorem : float or None
+        Bound of U(x_hat, x) by Theorem 3.1 (3.32).
+    reasons : tuple of str
+        Why there is no bound, or none by the theorem.
+    P_lower : array (nx, nx)
+    cap : float
+        Bound of U between any two states of the domain; a bound that is not smaller says nothing.
+    """
+
+    level: float | None
+    theorem: float | None
+    reasons: tuple[str, ...]
+    P_lower: Array
+    cap: float = float("inf")
+
+    @property
+    def size(self) -> float | None:
+        """Bound of |x_hat - x|_P_lower, the better of both."""
+        known = [level for level in (self.level, self.theorem) if level is not None]
+        return float(np.sqrt(min(known))) if known else None
+
+    @property
+    def certified(self) -> bool:
+        """Whether Theorem 3.1 holds at this instant."""
+        return self.theorem is not None
+
+    @property
+    def radii(self) -> Array | None:
+        """Bound of every |x_hat_i - x_i| (nx,), in the units of the states."""
+        if self.size is None:
+            return None
+        return frozen(self.size * np.sqrt(np.diagonal(np.linalg.inv(self.P_lower))))
+
+    def __str__(self) -> str:
+        if self.size is None:
+            return f"no bound: {'; '.join(self.reasons)}"
+        wide = ", as wide as the domain" if self.size**2 >= self.cap * (1 - 1e-9) else ""
+        return f"|error|_P <= {self.size:.4g}{wide}" + "".join(f"; not by Theorem 3.1: {r}" for r in self.reasons)
+
+
+@dataclass(frozen=True, eq=False)
 class Estimate:
     """The result of one solve, at time `t`.
 
@@ -360,6 +408,8 @@ class Estimate:
     status : Status
     seconds : float
         Wall-clock time of the call.
+    bound : ErrorBound or None
+        What is guaranteed of x; None for an estimator without a `Guarantee`.
     """
 
     t: float
@@ -372,6 +422,7 @@ class Estimate:
     _solved: SolvedWindow = field(repr=False)
     seconds: float = field(compare=False, default=float("nan"))
     _covariance: Callable[[], tuple[Array, int]] | None = field(default=None, repr=False)
+    bound: ErrorBound | None = field(default=None, repr=False)
 
     @cached_property
     def trajectory(self) -> Trajectory:

@@ -1,8 +1,8 @@
 """Horizon, rate and longest wait that a certificate guarantees: thesis (3.29)-(3.31), Remark 3.7, discrete time.
 
 They need one number of U, `ratio` = lambda_max(P_upper, P_lower): by (3.20) a window multiplies the error, measured
-by U, by at most 4 ratio eta^T. Times are in seconds and eta per second; in discrete time both count steps, and the wait is
-zero, since every window starts and ends at an estimate (Remark 3.7).
+by U, by at most 4 ratio eta^T. Times are in seconds and eta per second; in discrete time both count steps, and with an
+estimate at every step the wait is zero, since every window starts and ends at one (Remark 3.7).
 """
 
 from __future__ import annotations

@@ -13,9 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from ctmhe.certificates.guarantee import Guarantee
 from ctmhe.data.log import Log
 from ctmhe.data.window import held_inputs
 from ctmhe.errors import InputError, NotEstimated, TooLate
+from ctmhe.estimators.guaranteed import Guaranteed
 from ctmhe.estimators.guesses import open_loop, resting_guess, starting_points
 from ctmhe.estimators.outlook import carried_covariance, prior_covariance
 from ctmhe.estimators.priors import empty_path, filtering_prior, path_rows, trajectory_at
@@ -108,6 +110,8 @@ class MHE:
         `DiscreteModel` only: count the measurement at the estimate's own time.
     longest_wait : float, optional
         The longest wait between estimates, if declared; must be shorter than the horizon (3.19).
+    guarantee : Guarantee, optional
+        A certificate and how large disturbances are: every estimate then has a `bound`, or says why not.
     solver : {"gauss-newton", "numpy", "ipopt"}
         `gauss-newton` runs in the compiled core; `numpy` is the same method in Python, which also takes over where
         there is no core; `ipopt` is the reference.
@@ -149,6 +153,7 @@ class MHE:
         input_hold: str = "zero",
         filtering: bool = False,
         longest_wait: float | None = None,
+        guarantee: Guarantee | None = None,
         solver: str = "gauss-newton",
         compile: str | None = None,
         tolerance: float | None = None,
@@ -210,6 +215,7 @@ class MHE:
             input_hold=input_hold,
             filtering=filtering,
         )
+        self.guaranteed = None if guarantee is None else Guaranteed(guarantee, self)
         limits: dict[str, Any] = {"max_iterations": max_iterations or 100, "deadline": deadline, "clock": clock}
         if tolerance is not None:
             limits["tolerance"] = positive("tolerance", tolerance)
@@ -274,7 +280,17 @@ class MHE:
         if len(model.u) and u_start is not None:
             inputs = inputs.put(t, frozen(u_start))
         start = frozen(np.concatenate([x0, p0]))
-        return State(t, t, start, x0, p0, Log(len(model.y)), inputs, empty_path(self.stage), t)
+        track = None if self.guaranteed is None else self.guaranteed.begin(t, x0)
+        return State(t, t, start, x0, p0, Log(len(model.y)), inputs, empty_path(self.stage), t, track=track)
+
+    def doubt(self, state: State, t: float, reason: str) -> State:
+        """Return the state that knows that its data at `t` are not what a guarantee assumes, such as a lost message.
+
+        Estimates whose window reaches back to `t` then have no bound, for this reason; never again one if `t` is
+        infinite.
+        """
+        doubts = (*state.doubts, (float(t), reason))
+        return made(State, state.__dict__ | {"doubts": doubts})
 
     @staticmethod
     def _named(signals: Signals, values: Any, default: Array) -> Any:
@@ -546,6 +562,12 @@ class MHE:
             "solves": state.solves + 1,
             "prepared": None,
         }
+        bound = None
+        if self.guaranteed is not None:
+            first = float(solved.part("t")[0])
+            track = state.track or self.guaranteed.begin(state.t0, state.start[: self.stage.nx])
+            fields["track"], bound = self.guaranteed.after(track, first, t, cost, status, state.doubts)
+            fields["doubts"] = tuple(doubt for doubt in state.doubts if doubt[0] > edge)
         new = made(State, state.__dict__ | fields)
 
         def covariance() -> tuple[Array, int]:
@@ -556,7 +578,7 @@ class MHE:
         known = None if status.outcome is Outcome.PREDICTED else covariance
         seconds = self.clock() - began
         fields = {"t": t, "x": x, "p": p, "w": w, "y": y, "cost": cost, "status": status, "_solved": solved,
-                  "seconds": seconds, "_covariance": known}  # fmt: skip
+                  "seconds": seconds, "_covariance": known, "bound": bound}  # fmt: skip
         return new, made(Estimate, fields)
 
     def propagate(self, state: State, t0: float, t1: float, x: Array, p: Array) -> Array:

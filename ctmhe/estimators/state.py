@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ctmhe.certificates.guarantee import Track
 from ctmhe.data.log import Log
 from ctmhe.errors import InputError
 from ctmhe.transcription.solved import Layout, Solved
@@ -43,6 +44,10 @@ class State:
     solves : int
     prepared : object or None
         Says that the estimator has prepared the next estimate from this state; of no influence on its result.
+    track : Track or None
+        What the next estimate's guaranteed bound needs of the past.
+    doubts : tuple of (time, reason)
+        When data were not what the guarantee assumes.
     """
 
     t0: float
@@ -57,6 +62,8 @@ class State:
     window: Solved | None = None
     solves: int = 0
     prepared: object | None = None
+    track: Track | None = None
+    doubts: tuple[tuple[float, str], ...] = ()
 
     def knowing(self, measurements: Log, inputs: Log) -> State:
         """Return the state with other logs."""
@@ -78,6 +85,8 @@ def save_state(state: State, path: str | Path, fingerprint: dict[str, Any]) -> N
         "since": state.since,
         "solves": state.solves,
         "slots": None if state.window is None else state.window.n,
+        "track": None if state.track is None else asdict(state.track),
+        "doubts": state.doubts,
     }
     path = Path(path)
     temporary = path.with_name(path.name + ".part")
@@ -110,6 +119,9 @@ def load_state(path: str | Path, fingerprint: dict[str, Any], layout: Layout) ->
     window = None
     if header["slots"] is not None:
         window = Solved.copied(layout, header["slots"], arrays["window_values"], arrays["window_active"])
+    track = header.get("track")
+    if track is not None:
+        track = Track(**track | {name: tuple(track[name]) for name in ("ends", "levels")})
     logs = {name: Log.of(arrays[f"{name}_t"], rows := arrays[f"{name}_rows"], rows.shape[1]) for name in LOGS}
     return State(
         t0=header["t0"],
@@ -120,5 +132,7 @@ def load_state(path: str | Path, fingerprint: dict[str, Any], layout: Layout) ->
         since=header["since"],
         window=window,
         solves=header["solves"],
+        track=track,
+        doubts=tuple((t, reason) for t, reason in header.get("doubts", ())),
         **logs,
     )

@@ -13,10 +13,11 @@ import numpy as np
 from ctmhe.errors import CtmheError, FmuUnsupportedError, InputError, TriggerError
 from ctmhe.estimators.mhe import MHE
 from ctmhe.models.signals import Signals
-from ctmhe.simulation.channel import Channel, Delivery, check_hold
+from ctmhe.simulation.channel import Channel, Delivery, Everything, WholeSignal, check_hold
 from ctmhe.simulation.drivers import Driver
 from ctmhe.simulation.follower import Follower
 from ctmhe.simulation.location import first_reached
+from ctmhe.simulation.network import Network
 from ctmhe.simulation.plants import Plant
 from ctmhe.simulation.recorder import Recorder
 from ctmhe.simulation.run import Run
@@ -124,6 +125,8 @@ class Loop:
         self.followers = (self.estimator,) if self.channel.faithful else (self.estimator, self.sensor)
         unsent = frozen(np.full(len(self.model.y), np.nan))
         self.now = Progress(start, WatchState(()), unsent, start)
+        for reason in self._against_guarantees():
+            self._doubt(np.inf, reason)
         self.segment = self._segment(self._after(0))
         crossed = False
         try:
@@ -137,6 +140,22 @@ class Loop:
         if not self.now.samples:
             logger.warning("policy %r never fired from %g s to %g s", self.watch.policy, start, self.now.t)
         return self.recorder.finish(p_true)
+
+    def _against_guarantees(self) -> list[str]:
+        """Return what stands against a guarantee of the estimator: less than the whole signal, or later."""
+        if self.mhe.guaranteed is None:
+            return []
+        network = self.channel if isinstance(self.channel, Network) else None
+        inner = network.channel if network else self.channel
+        reasons = [] if isinstance(inner, (WholeSignal, Everything)) else [f"channel {inner!r}: not the whole signal"]
+        if network and network.late:
+            reasons.append("the channel delays or redates measurements: what is known at a solve ends before it")
+        return reasons
+
+    def _doubt(self, t: float, reason: str) -> None:
+        """Let the estimator know that its data at `t` are not what a guarantee assumes."""
+        if self.mhe.guaranteed is not None:
+            self.estimator.state = self.mhe.doubt(self.estimator.state, t, reason)
 
     def _check_way_back(self) -> None:
         """Raise when events are to be located by going back, and the plant cannot."""
@@ -331,6 +350,7 @@ class Loop:
             self.sensor.observe(item.measurement for item in message)
         if np.isinf(message[0].at):
             now.lost += 1
+            self._doubt(now.t, f"a message was lost at t = {now.t:g} s")
         elif queue is now.records:
             queue.extend(message)
         else:

@@ -79,6 +79,12 @@ class Network:
                 positive(value, "Network: quantum")
 
     @property
+    def late(self) -> bool:
+        """Whether measurements arrive later than they are dated, or are dated wrongly."""
+        longest = self.delay[1] if isinstance(self.delay, (tuple, list)) else self.delay
+        return longest > 0 or self.clock_offset != 0
+
+    @property
     def faithful(self) -> bool:
         """False: what arrives is not what was measured."""
         return False

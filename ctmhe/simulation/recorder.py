@@ -37,6 +37,13 @@ MESSAGES = {
     "outcome": "how the estimate came about",
     "status": "what the solvers report",
     "delivered": "measurements that the estimate was the first to know",
+    "x_true_solve": "true state at the instants of the estimates",
+    "window_start": "start of the estimate's window",
+    "x_prior": "prior estimate at the start of the window",
+    "window_level": "guaranteed bound of U(x_hat, x), window by window (thesis 3.20, 3.25); NaN where there is none",
+    "theorem_level": "guaranteed bound of U(x_hat, x) by Theorem 3.1 (thesis 3.32); NaN where there is none",
+    "uncertified": "why there is no such bound",
+    "retro_level": "guaranteed bound of U along the estimated trajectory (thesis 3.20)",
 }
 
 
@@ -56,6 +63,9 @@ class Recorder:
             "w": np.full((n, len(plant.w)), np.nan),
             "level": np.full(n, np.nan),
         }
+        self.guaranteed = loop.mhe.guaranteed
+        if self.guaranteed is not None:
+            self.grid["retro_level"] = np.full(n, np.nan)
         self.rows = 0
         self.events: list[dict[str, Any]] = []
         self.solves: list[dict[str, Any]] = []
@@ -75,6 +85,7 @@ class Recorder:
     def solved(self, state: Any, estimate: Estimate, t: float, previous: float, delivered: int) -> None:
         """Keep an estimate, and append its piece of the estimated trajectory (3.16) on (previous, t]."""
         status = estimate.status
+        known = np.append(self.loop.plant.state(), np.nan)
         self.solves.append(
             {
                 "solve_time": t,
@@ -87,13 +98,26 @@ class Recorder:
                 "outcome": status.outcome.name.lower(),
                 "status": str(status),
                 "delivered": delivered,
+                "x_true_solve": known[self.x_map],
             }
         )
+        if estimate.bound is not None:
+            bound, nx = estimate.bound, len(self.loop.model.x)
+            self.solves[-1] |= {
+                "window_start": float(estimate.trajectory.t[0]),
+                "x_prior": np.array(estimate.prior[:nx]),
+                "window_level": np.nan if bound.level is None else bound.level,
+                "theorem_level": np.nan if bound.theorem is None else bound.theorem,
+                "uncertified": "; ".join(bound.reasons),
+            }
         slack = tolerance(t)
         first = max(previous, float(estimate.trajectory.t[0]))
         start, stop = np.searchsorted(self.times, [first + slack, t + slack], side="right")
         for k in range(start, stop):
-            self.grid["x_retro"][k] = self.loop.mhe.trajectory(state, min(float(self.times[k]), t))
+            at = min(float(self.times[k]), t)
+            self.grid["x_retro"][k] = self.loop.mhe.trajectory(state, at)
+            if self.guaranteed is not None and estimate.bound is not None and estimate.bound.level is not None:
+                self.grid["retro_level"][k] = self.guaranteed.bounds.at(state.track, at)
 
     def finish(self, p_true: Any) -> Run:
         """Return the run as far as it went."""
@@ -111,6 +135,10 @@ class Recorder:
         events = {"sample_time": float, "gap": float, "y_sampled": outputs}
         solves = {"solve_time": float, "solve_seconds": float, "cost": float, "iterations": np.int64, "success": bool}
         solves |= {"delivered": np.int64, "outcome": object, "status": object, "x_hat": states, "p_hat": parameters}
+        solves |= {"x_true_solve": states}
+        if self.guaranteed is not None:
+            solves |= {"window_start": float, "x_prior": states, "window_level": float, "theorem_level": float}
+            solves |= {"uncertified": object}
         for along, rows, columns in (("event", self.events, events), ("solve", self.solves, solves)):
             for name, kind in columns.items():
                 column = [row[name] for row in rows]
@@ -140,8 +168,9 @@ class Recorder:
             ("parameter", model.p),
         ):
             data = data.assign_coords(_names(dim, group))
-        for name in ("sample_time", "gap", "solve_time", "solve_seconds"):
-            data[name].attrs["units"] = "s"
+        for name in ("sample_time", "gap", "solve_time", "solve_seconds", "window_start"):
+            if name in data:
+                data[name].attrs["units"] = "s"
         data.attrs = {
             "format": FORMAT,
             "plant": plant.name,
@@ -160,9 +189,18 @@ class Recorder:
             "messages_lost": int(now.lost),
             "bytes_sent": int(now.bytes),
             "hushed": int(now.hushed),
+            **self._certificate(),
             "sensor_solves": 0 if loop.sensor is loop.estimator else int(loop.sensor.solves),
         }
         return Run(data)
+
+    def _certificate(self) -> dict[str, Any]:
+        """Return the numbers behind the bounds: as attributes, so that a saved run keeps them."""
+        if self.guaranteed is None:
+            return {}
+        bounds, P = self.guaranteed.bounds, self.guaranteed.bounds.certificate.P_lower
+        about = f"{bounds.certificate.method}, {'proof' if bounds.certificate.rigorous else 'evidence'}"
+        return {"certificate": about, "P_lower": P.reshape(-1), "domain_level": bounds.cap, "wait_limit": bounds.limit}
 
     def _location(self) -> str:
         """Return in words how the times of events were found."""

@@ -29,8 +29,9 @@ class Run:
         On `time` (monitoring times, seconds): `x_true`, `x_online`, `x_retro` by state, `y` by output, `u` by input,
         `w` by disturbance, `level` of the trigger. On `event` (samples): `sample_time`, `gap`, `y_sampled`. On `solve`
         (estimates: one a sample, or a message that arrived): `solve_time`, `x_hat`, `p_hat`, `solve_seconds`, `cost`,
-        `iterations`, `success`, `outcome`, `status`, `delivered`. Units are in the coordinates `state_unit`, ... and in
-        attributes; how the run was made is in the dataset's attributes.
+        `iterations`, `success`, `outcome`, `status`, `delivered`, `x_true_solve`; with a guarantee also its levels.
+        Units are in the coordinates `state_unit`, ... and in attributes; how the run was made is in the dataset's
+        attributes.
     """
 
     def __init__(self, dataset: xr.Dataset):
@@ -144,6 +145,51 @@ class Run:
         squares = np.sum(self._error("x_retro").to_numpy() ** 2, axis=1)
         return float(np.trapezoid(squares, self.t))
 
+    @property
+    def certified_bound(self) -> xr.DataArray:
+        """Guaranteed bound of |x_hat(t_i) - x(t_i)|_P_lower by Theorem 3.1 (3.32), on the solves.
+
+        NaN where the theorem's conditions were not met; `uncertified` says why. See docs/guarantees.md.
+
+        Raises
+        ------
+        InputError
+            For a run whose estimator had no `Guarantee`.
+        """
+        return self._level("theorem_level")
+
+    @property
+    def window_bound(self) -> xr.DataArray:
+        """Guaranteed bound of |x_hat(t_i) - x(t_i)|_P_lower from the windows' own costs (3.25), on the solves."""
+        return self._level("window_level")
+
+    @property
+    def retrospective_bound(self) -> xr.DataArray:
+        """Guaranteed bound of |x_hat - x|_P_lower along the estimated trajectory (3.20), on the monitoring times."""
+        return self._level("retro_level")
+
+    @property
+    def uncertified(self) -> tuple[str, ...]:
+        """Why Theorem 3.1 gives no bound, for every solve; an empty text where it does."""
+        self._level("theorem_level")
+        return tuple(str(text) for text in self.dataset["uncertified"].to_numpy())
+
+    @property
+    def error_size(self) -> xr.DataArray:
+        """The true |x_hat(t_i) - x(t_i)|_P_lower on the solves, to be compared with the bounds."""
+        self._level("theorem_level")
+        n = self.dataset.sizes["state"]
+        P = np.asarray(self.dataset.attrs["P_lower"], dtype=float).reshape(n, n)
+        error = self.dataset["x_hat"] - self.dataset["x_true_solve"]
+        squares = np.einsum("ki,ij,kj->k", error.to_numpy(), P, error.to_numpy())
+        return error.isel(state=0, drop=True).copy(data=np.sqrt(squares))
+
+    def _level(self, name: str) -> xr.DataArray:
+        if name not in self.dataset:
+            raise InputError("run: its estimator had no certificate; build it with MHE(guarantee=Guarantee(...))")
+        levels = self.dataset[name]
+        return levels.copy(data=np.sqrt(levels.to_numpy()))
+
     def to_pandas(self) -> pd.DataFrame:
         """Return a table over the monitoring times with columns `x_true.<state>`, ..., `y.<output>`, ..."""
         import pandas as pd
@@ -236,6 +282,12 @@ class Run:
         ]
         if self.hushed:
             rows.append(f"  guards silenced {self.hushed} times: they came back right after a sample")
+        if "theorem_level" in self.dataset and self.solves:
+            met = int(np.isfinite(self.dataset["theorem_level"].to_numpy()).sum())
+            known = int(np.isfinite(self.dataset["window_level"].to_numpy()).sum())
+            rows.append(
+                f"  guarantee ({about['certificate']}): Theorem 3.1 at {met} solves, a window's bound at {known}"
+            )
         if self.solves:
             rows.append(f"  solve time: median {1e3 * np.median(self.solve_seconds):.3g} ms")
         if not np.isnan(self.dataset["x_true"].to_numpy()).any():

@@ -2,6 +2,7 @@
 
 from ctmhe.triggers.base import Outlook, Predicate, Trigger, TriggerContext, trigger
 from ctmhe.triggers.budget import Budget, DutyCycle, TokenBucket
+from ctmhe.triggers.certified import BoundSelfTriggered, Certified
 from ctmhe.triggers.compose import And, Hysteresis, MaxInterval, MinInterval, Or
 from ctmhe.triggers.covariance import CovarianceBound, CovarianceSelfTriggered
 from ctmhe.triggers.crossing import LevelCrossing
@@ -17,7 +18,9 @@ from ctmhe.triggers.watch import Watch, WatchState
 
 __all__ = [
     "And",
+    "BoundSelfTriggered",
     "Budget",
+    "Certified",
     "CovarianceBound",
     "CovarianceSelfTriggered",
     "Deadband",
