@@ -101,10 +101,11 @@ def _scaled(own: DetectabilityCertificate, mhe: MHE) -> tuple[DetectabilityCerti
     weights = [weight_matrix(getattr(cost, key), group, key) for key, group in zip("PQR", names, strict=True)]
     P, Q, R = weights[0] / 2, weights[1] / 2, weights[2]
     same = ((P, own.P_upper), (Q, own.Q), (R, own.R))
-    if abs(cost.eta - own.eta) <= 1e-12 and all(np.allclose(a, b, rtol=1e-12, atol=0.0) for a, b in same):
+    eta = float(cost.eta or 1.0)
+    if abs(eta - own.eta) <= 1e-12 and all(np.allclose(a, b, rtol=1e-12, atol=0.0) for a, b in same):
         return own, []
     try:
-        return own.for_weights(P, Q, R, float(cost.eta or 1.0)), []
+        return own.for_weights(P, Q, R, eta), []
     except InputError as error:
         return own, [f"the cost's weights are not covered (3.14): {error}"]
 
