@@ -246,7 +246,7 @@ def test_an_fmu_gives_the_design_of_its_equations_as_evidence():
     domain = Bounds(x=(0.1, 5), w=(-0.1, 0.1), p=rates)
     fmu = FmuModel(build("batch_reactor", fmi=2), inputs=[], parameters=["k1"])
     own = design_excitation(batch_reactor(parameters=("k1",), noise=False), domain, mu=0.4)
-    found = design_excitation(fmu, Bounds(x=(0.1, 5), p=rates), mu=0.4)
+    found = design_excitation(fmu, domain, mu=0.4)
     assert own.rigorous and not found.rigorous and found.method == "grid"
     assert found.margin >= 0 and found.R.shape == own.R.shape
 
