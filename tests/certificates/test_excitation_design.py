@@ -18,7 +18,7 @@ from ctmhe.errors import CertificateError, InputError
 from ctmhe.models import ContinuousModel, DiscreteModel
 from ctmhe.models.library import batch_reactor, chua, chua_discrete
 from ctmhe.types import Bounds
-from tests.certificates.trajectories import decay, mixer, quadratic, rate, trajectory
+from tests.certificates.trajectories import decay, inside, mixer, quadratic, rate, trajectory
 
 settings.register_profile("certificates", deadline=None, max_examples=25)
 settings.load_profile("certificates")
@@ -95,6 +95,8 @@ def test_parameters_differ_no_more_than_the_set_allows(name, seed):
     start = first.x[0] + near * (trajectory(made.model, 1, rng, h=h).x[0] - first.x[0])
     w = first.w + quiet * rng.normal(size=first.w.shape) * 1e-3
     second = trajectory(made.model, steps, rng, h=h, x=start, u=first.u0, w=w)
+    if not inside(made.model, second):
+        return
     alpha = ExcitationMonitor(made).between(first, second).level
     if alpha <= 1e-12:
         return
