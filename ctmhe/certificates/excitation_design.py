@@ -31,7 +31,7 @@ from scipy.optimize import minimize_scalar
 
 from ctmhe.certificates.excited_set import Drift, ExcitationDesign
 from ctmhe.certificates.increments import Cover, Increments, Jacobians, constant
-from ctmhe.certificates.injection import SLACKS, Units, design, gathered, least_upper_bound, phi_factor
+from ctmhe.certificates.injection import SLACKS, SPEEDS, Units, design, gathered, least_upper_bound, phi_factor
 from ctmhe.errors import CertificateError, InputError
 from ctmhe.models.continuous import Model
 from ctmhe.types import Array, Bounds, frozen, positive
@@ -98,40 +98,42 @@ def design_excitation(
     T = 200.0 / pace if horizon is None else positive("design_excitation: horizon", horizon)
     samples = increments.at(increments.random(64, np.random.default_rng(2)))
 
-    def attempt(factor: float, least: float = SLACKS[0]) -> tuple[float, Any]:
-        noise, *found, L = design(units, points, centre, factor, T, compensated=compensated, least=least)
+    def attempt(factor: float, least: float, speed: float) -> tuple[float, Any]:
+        noise, *found, L = design(units, points, centre, factor, T, compensated=compensated, least=least, speed=speed)
         Phi, G = centre.A[0] + L @ centre.C[0], samples.E + L @ samples.F
         information, memory = gathered(units, factor, T, Phi, G, centre.C[0], samples.F)
         contracts = max(1 - 4 * factor**T, 1e-12)
         return noise * memory / (max(information, 1e-300) * contracts), (*found, L)
 
-    failure, made = None, None
-    for round_, least in enumerate(SLACKS):
+    failure, chosen = None, mu
+    for round_, (least, speed) in enumerate(zip(SLACKS, SPEEDS, strict=True)):
         try:
-            if mu is None:
-                mu = _best_factor(attempt, 1.1 * np.log(4) / T, min(pace, 4.0) if units.discrete else pace)
-            P, Q, R, L = attempt(mu, least)[1]
-            made = ExcitationDesign(
-                increments, frozen(P), frozen(Q), frozen(R), float(mu), float(mu), frozen(L),
-                A=frozen(centre.A[0]) if compensated else None, C=frozen(centre.C[0]),
-                Phi=frozen(centre.A[0] + L @ centre.C[0]) if fixed else None,
-                scope="global" if fixed and _follows_one(increments, compensated) else "local", H=None,
-                method=cover.method, rigorous=cover.rigorous, margin=np.nan, notes=notes,
-                worst=(increments.centre, increments.centre),
-            )  # fmt: skip
-            made, met = _verified(made, points, round_)
-            if made.margin >= -1e-10:
-                return made if B_p is None else replace(made, drift=_drift(made, B_p))
-            failure = (
-                f"the inequality fails by {-made.margin:.2g} (nominal units, over R) at points that the solver did not "
-                f"see, or by its inaccuracy. Try another mu than {mu:.4g}, a smaller domain, or nominal= nearer to the "
-                "sizes of the signals"
-            )
-            if not cover.rigorous:  # samples are refined where they were too few
-                points = Jacobians(*(np.concatenate(parts) for parts in zip(points, met, strict=True)))
+            if chosen is None:
+                slowest, fastest = 1.1 * np.log(4) / T, min(pace, 4.0) if units.discrete else pace
+                chosen = _best_factor(lambda factor: attempt(factor, SLACKS[0], speed)[0], slowest, fastest)  # noqa: B023
+            P, Q, R, L = attempt(chosen, least, speed)[1]
         except CertificateError as error:
             failure = error
-    raise CertificateError(f"design_excitation: {_why_not(centre, mu, units.discrete, model)}{failure}")
+            continue
+        made = ExcitationDesign(
+            increments, frozen(P), frozen(Q), frozen(R), float(chosen), float(chosen), frozen(L),
+            A=frozen(centre.A[0]) if compensated else None, C=frozen(centre.C[0]),
+            Phi=frozen(centre.A[0] + L @ centre.C[0]) if fixed else None,
+            scope="global" if fixed and _follows_one(increments, compensated) else "local", H=None,
+            method=cover.method, rigorous=cover.rigorous, margin=np.nan, notes=notes,
+            worst=(increments.centre, increments.centre),
+        )  # fmt: skip
+        made, met = _verified(made, points, round_)
+        if made.margin >= -1e-10:
+            return made if B_p is None else replace(made, drift=_drift(made, B_p))
+        failure = (
+            f"the inequality fails by {-made.margin:.2g} (nominal units, over R) at points that the solver did not "
+            f"see, or by its inaccuracy. Try another mu than {chosen:.4g}, a smaller domain, or nominal= nearer to the "
+            "sizes of the signals"
+        )
+        if not cover.rigorous:  # samples are refined where they were too few
+            points = Jacobians(*(np.concatenate(parts) for parts in zip(points, met, strict=True)))
+    raise CertificateError(f"design_excitation: {_why_not(centre, chosen, units.discrete, model)}{failure}")
 
 
 def _cover(increments: Increments) -> tuple[Cover, tuple[str, ...]]:
@@ -144,20 +146,28 @@ def _cover(increments: Increments) -> tuple[Cover, tuple[str, ...]]:
     return Cover(both, "grid", False), (note,)
 
 
-def _best_factor(attempt: Any, slowest: float, fastest: float) -> float:
-    """Return mu of the least score for rates between two: a coarse search, then a fine one."""
-    rates = np.geomspace(slowest, max(fastest, 1.5 * slowest), 6)
+def _best_factor(score_of: Any, slowest: float, fastest: float) -> float:
+    """Return mu of the least score for rates between two: a coarse search, then a fine one.
+
+    Raises
+    ------
+    CertificateError
+        If there is no design at any of the rates.
+    """
+    rates, failure = np.geomspace(slowest, max(fastest, 1.5 * slowest), 6), None
 
     def score(log_rate: float) -> float:
+        nonlocal failure
         try:
-            return float(np.log(attempt(float(np.exp(-np.exp(log_rate))))[0]))
-        except CertificateError:
+            return float(np.log(score_of(float(np.exp(-np.exp(log_rate))))))
+        except CertificateError as error:
+            failure = error
             return 1e3
 
     scores = [score(np.log(rate)) for rate in rates]
     best = int(np.argmin(scores))
     if scores[best] >= 1e3:
-        return float(np.exp(-slowest))
+        raise failure or CertificateError("no rate was tried")
     edges = np.log(rates[[max(best - 1, 0), min(best + 1, len(rates) - 1)]])
     found: Any = minimize_scalar(score, bounds=tuple(edges), method="bounded", options={"maxiter": 7})
     return float(np.exp(-np.exp(found.x) if found.fun < scores[best] else -rates[best]))

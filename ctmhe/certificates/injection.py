@@ -16,8 +16,12 @@ from ctmhe.types import Array
 SLACKS = (1e-7, 1e-6, 1e-6, 1e-5, 1e-5)
 """Demanded of the program in its own units; solutions are inaccurate, and one that fails is sought with more."""
 
-FASTEST = 3.0
-"""Continuous time: how much faster than the model itself Phi may be; without noise in y the best gain is infinite."""
+SPEEDS = (3.0, 3.0, 30.0, 300.0, 3000.0)
+"""Continuous time: how much faster than the model itself Phi may be, from round to round.
+
+Without a limit the best gain is infinite, which costs no noise but leaves no information in Y. A slow mode that has to
+fade faster by far than by itself asks for more.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,12 +108,13 @@ def design(
     *,
     compensated: bool,
     least: float = SLACKS[0],
+    speed: float = SPEEDS[0],
 ) -> tuple[float, Array, Array, Array, Array]:
     """Return what noise of nominal size adds to W per step or second, per nominal |y|^2, and P, Q, R, L at the centre.
 
     That is made small, together with what a start that is wrong by nominal states leaves in W after the horizon.
     `compensated`: L follows A, so that only the part of A that outputs do not see varies in Phi. `least`: smallest
-    eigenvalue demanded.
+    eigenvalue demanded; `speed`: see `SPEEDS`.
     """
     cp = require_cvxpy()
     pace = 1.0 if units.discrete else units.pace(points)  # the program's unit of time: entries of size one
@@ -137,7 +142,7 @@ def design(
         else:
             half = in_z @ gain
             matrix = matrix - rate * (in_z @ P @ in_z.T) - half - half.T
-            constraints.append(gain[:, :n] + gain[:, :n].T >> -2 * max(FASTEST, 3 * rate) * P)
+            constraints.append(gain[:, :n] + gain[:, :n].T >> -2 * max(speed, 3 * rate) * P)
         constraints.append((matrix + matrix.T) / 2 >> least * np.eye(matrix.shape[0]))
     inside = np.linalg.inv(start)
     left = np.exp(-rate * pace * horizon)
@@ -148,7 +153,7 @@ def design(
     L = pace * units.x @ np.linalg.solve(P.value, Y.value) @ y
     supply = w @ (Q.value if Q is not None else np.zeros((0, 0))) @ w
     P_, Q_, R_ = (size * (part + part.T) / 2 for part in (x.T @ P.value @ x / pace, supply, y @ R.value @ y))
-    return float(noise.value), P_, Q_, R_, L
+    return float(np.squeeze(noise.value)), P_, Q_, R_, L
 
 
 def gathered(units: Units, mu: float, horizon: float, Phi: Array, G: Array, C: Array, F: Array) -> tuple[float, float]:

@@ -7,6 +7,7 @@ from scipy.integrate import solve_ivp
 
 from ctmhe.certificates.increments import Increments
 from ctmhe.models import ContinuousModel, DiscreteModel
+from ctmhe.models.continuous import box_arrays
 from ctmhe.types import Bounds, Trajectory
 
 
@@ -19,7 +20,22 @@ def rate(model, x, u, w, p):
     return np.asarray(model.dynamics(0.0, x, u, w, p)).ravel()
 
 
-def trajectory(model, steps, rng, *, h=None, size=1.0, x=None, p=None, u=None, w=None, B_p=None) -> Trajectory:
+def inside(model, run: Trajectory) -> bool:
+    """Whether states and parameters stay in the domain, where certificates claim something."""
+    boxes = ((box_arrays(getattr(model, key), getattr(model.bounds, key), key), getattr(run, key)) for key in "xp")
+    return all(((lower <= v) & (v <= upper)).all() for (lower, upper), v in boxes)
+
+
+def trajectory(model, steps, rng, *, x=None, **given) -> Trajectory:
+    """A trajectory from x, or from a random start of the domain that it does not leave; see `one_trajectory`."""
+    for _ in range(100):
+        made = one_trajectory(model, steps, rng, x=x, **given)
+        if x is not None or inside(model, made):
+            return made
+    raise AssertionError("no trajectory stays in the domain")
+
+
+def one_trajectory(model, steps, rng, *, h=None, size=1.0, x=None, p=None, u=None, w=None, B_p=None) -> Trajectory:
     """A trajectory from a random start of the domain, with w of `size` times the domain, held over slots of h."""
     increments, h = (
         Increments(model, Bounds(**{k: getattr(model.bounds, k) for k in "xwp"}), u=(-1, 1)),
