@@ -265,6 +265,12 @@ class Run:
 
         return plot_run(self.dataset, axes)
 
+    def plot_bounds(self, axes: Any = None) -> Any:
+        """Draw the guaranteed bounds beside the true error; return the Axes. See `ctmhe.plotting.plot_bounds`."""
+        from ctmhe.plotting import plot_bounds
+
+        return plot_bounds(self.dataset, axes)
+
     def __repr__(self) -> str:
         about, n = self.dataset.attrs, self.samples
         between = self.gaps[1:]
