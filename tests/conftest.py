@@ -7,6 +7,7 @@ import os
 import casadi as ca
 import numpy as np
 import pytest
+from hypothesis import settings
 
 from ctmhe.estimators import MHE
 from ctmhe.models import ContinuousModel
@@ -14,6 +15,9 @@ from ctmhe.transcription import RK4
 from ctmhe.types import DiscountedCost, Measurement
 
 os.environ.setdefault("CTMHE_COMPILE", "off")  # hundreds of small models: those that need the compiler ask for it
+
+settings.register_profile("ctmhe", deadline=None)  # no test depends on the clock
+settings.load_profile("ctmhe")
 
 P_REACTOR = np.array([[4.009, 3.768], [3.768, 3.549]])  # thesis 3.4.1, continuous time
 REACTOR_COST = DiscountedCost(eta=0.4, P=2 * P_REACTOR, Q=2 * np.diag([1e3, 1e3, 1e2]), R=1e2)

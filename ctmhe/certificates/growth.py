@@ -49,12 +49,11 @@ class Growth:
     def ahead(self, size: float, seconds: float) -> float:
         """Return the bound of r so many seconds after it was at most `size`; in between for steps not begun."""
         if self.step is None:
-            growth = np.exp(self.rate * seconds)
-            reach = seconds if self.rate == 0 else np.expm1(self.rate * seconds) / self.rate
+            growth, span = np.exp(self.rate * seconds), seconds
         else:
-            steps = np.ceil(seconds / self.step * (1 - 1e-9))
-            growth = (1 + self.rate) ** steps
-            reach = steps if self.rate == 0 else (growth - 1) / self.rate
+            span = np.ceil(seconds / self.step * (1 - 1e-9))
+            growth = (1 + self.rate) ** span
+        reach = span if abs(self.rate) * span < 1e-9 else (growth - 1) / self.rate
         return float(growth * size + self.push * reach)
 
     def time_to(self, target: float, size: float) -> float:
@@ -69,12 +68,11 @@ class Growth:
                     return float("inf")
                 count += 1
             return max(count - 1, 0) * self.step if bound >= target else float("inf")
-        slope = self.rate * target + self.push
-        if slope <= 0 or self.rate * size + self.push <= 0:
+        slopes = self.rate * size + self.push, self.rate * target + self.push
+        if min(slopes) <= 0:
             return float("inf")
-        if self.rate == 0:
-            return (target - size) / self.push
-        return float(np.log(slope / (self.rate * size + self.push)) / self.rate)
+        change = self.rate * (target - size) / slopes[0]
+        return float((target - size) / slopes[0] if abs(change) < 1e-9 else np.log1p(change) / self.rate)
 
 
 def predict_growth(model: Model, guarantee: Guarantee, *, u: Any = None) -> Growth:
