@@ -73,7 +73,7 @@ class DetectabilityCertificate:
 
     def __post_init__(self) -> None:
         for name in ("P_lower", "P_upper", "Q", "R"):
-            object.__setattr__(self, name, frozen(_definite(getattr(self, name), name, zero=name == "Q")))
+            object.__setattr__(self, name, frozen(definite(getattr(self, name), name, zero=name == "Q")))
         if self.P_lower.shape != self.P_upper.shape:
             raise InputError(f"P_lower is {self.P_lower.shape}, P_upper {self.P_upper.shape}; they bound one function")
         if largest_ratio(self.P_lower, self.P_upper) > 1 + 1e-9:
@@ -121,7 +121,7 @@ class DetectabilityCertificate:
             Not below the certificate's, which it is when left out.
         """
         P, Q, R = (
-            _definite(_matrix(given, len(own), name), name)
+            definite(as_matrix(given, len(own), name), name)
             for given, own, name in ((P, self.P_upper, "P"), (Q, self.Q, "Q"), (R, self.R, "R"))
         )
         eta = self.eta if eta is None else float(eta)
@@ -140,7 +140,7 @@ class DetectabilityCertificate:
         return np.sqrt(np.einsum("...i,ij,...j->...", error, self.P_lower, error))
 
 
-def _matrix(value: Any, n: int, what: str) -> Array:
+def as_matrix(value: Any, n: int, what: str) -> Array:
     array = np.asarray(value, dtype=float)
     if array.ndim == 0:
         return array * np.eye(n)
@@ -151,7 +151,7 @@ def _matrix(value: Any, n: int, what: str) -> Array:
     return array
 
 
-def _definite(value: Any, what: str, *, zero: bool = False) -> Array:
+def definite(value: Any, what: str, *, zero: bool = False) -> Array:
     """Return a symmetric positive definite matrix, `zero`: or a semidefinite one."""
     array = np.asarray(value, dtype=float)
     if array.ndim != 2 or array.shape[0] != array.shape[1] or not np.isfinite(array).all():

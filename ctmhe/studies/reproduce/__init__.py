@@ -6,10 +6,16 @@ from collections.abc import Callable
 from typing import Any
 
 from ctmhe.errors import InputError
-from ctmhe.studies.reproduce import study_reactor_budget, study_solves_saved, thesis_3_4_1_ct
+from ctmhe.studies.reproduce import (
+    study_reactor_budget,
+    study_solves_saved,
+    thesis_3_4_1_certificate,
+    thesis_3_4_1_ct,
+)
 
 CASES: dict[str, Callable[..., dict[str, Any]]] = {
     "thesis-3.4.1-ct": thesis_3_4_1_ct.reproduce,
+    "thesis-3.4.1-certificate": thesis_3_4_1_certificate.reproduce,
     "study-reactor-budget": study_reactor_budget.reproduce,
     "study-solves-saved": study_solves_saved.reproduce,
 }

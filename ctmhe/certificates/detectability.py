@@ -1,0 +1,312 @@
+"""Certificates of detectability for a model on a domain: Theorem 7.2 in continuous, Corollary 7.1 in discrete time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.linalg import eigh
+from scipy.optimize import minimize_scalar
+
+from ctmhe.certificates.certificate import DetectabilityCertificate, as_matrix, definite
+from ctmhe.certificates.diagnosis import demand_continuity, leaving, point, unseen_mode
+from ctmhe.certificates.increments import Cover, Increments, Jacobians
+from ctmhe.certificates.inequality import GAIN, Form, Program, Sizes, Wanted
+from ctmhe.certificates.injection import Units
+from ctmhe.errors import CertificateError, InputError
+from ctmhe.models.continuous import Model
+from ctmhe.types import Array, Bounds
+
+OBJECTIVES = ("gain", "rate", "P", "conditioning", "horizon")
+SLACKS = (1e-7, 1e-6, 1e-5, 1e-4)
+FRESH, FIRST, ROUNDS = 2000, 24, 25
+ROUNDING = 1e-12
+"""Of the largest entry: an eigenvalue that is not below its negative is taken for zero."""
+
+
+def certify_detectability(
+    model: Model,
+    domain: Bounds | None = None,
+    *,
+    u: Any = None,
+    eta: float | None = None,
+    rate: float | None = None,
+    P: Any = None,
+    Q: Any = None,
+    R: Any = None,
+    objective: str | None = None,
+    jacobians: Cover | None = None,
+    seed: int = 0,
+) -> DetectabilityCertificate:
+    """Find, or check, a quadratic i-iIOSS Lyapunov function of a model on a domain.
+
+    Parameters
+    ----------
+    model : Model
+        Whose functions do not depend on time. Parameters are known and constant, anywhere in their box.
+    domain : Bounds, optional
+        Boxes of x, w and p, convex therefore; the model's own when left out. What no Jacobian depends on may be free.
+    u : box, optional
+        Range of the inputs, in any form of `Bounds`.
+    eta : float in (0, 1), optional
+        Factor per second, or per step; with `objective` "rate" and "horizon" it is found.
+    rate : float > 0, optional
+        -ln eta, in place of it.
+    P, Q, R : scalar, diagonal or matrix, optional
+        Weights of one's own, model units. With all of them, and eta, they are only checked.
+    objective : str, optional
+        `gain`: least Q and R for P at least one, in nominal units; the default if eta is given. `rate`: smallest eta,
+        the default if not; noise of nominal size then weighs at most `GAIN` as much as an error of nominal size, since
+        otherwise observable models have any. `P`: largest smallest eigenvalue of P, for given Q and R.
+        `conditioning`: least condition number of P, in nominal units. `horizon`: shortest horizon (3.30); for a given P it
+        bounds U from above, and the function below it is found; without P the same as `rate`.
+    jacobians : Cover, optional
+        Jacobians of one's own whose hull holds those of the domain: the certificate is as rigorous as they are.
+    seed : int
+        Of the fresh points.
+
+    Returns
+    -------
+    DetectabilityCertificate
+        Whose `margin` is the smallest eigenvalue of the inequality at fresh points: (7.33) and (7.26) with the sign
+        changed, x and w in nominals. For outputs that are not affine at fresh pairs, mean values on the line between.
+
+    Raises
+    ------
+    CertificateError
+        If there is none: the direction that shows it, or the worst point.
+    InputError
+        For a domain without bounds where a Jacobian depends on them, a model that may jump, and arguments that do not
+        fit.
+    """
+    found = _asked(model, eta, rate, objective, P, Q, R)
+    increments = Increments(model, domain, u=u)
+    demand_continuity(increments)
+    search = Search(increments, jacobians or increments.cover("ABCD"), seed)
+    eta, form = found.answer(search)
+    margin, v, second = search.fresh(form, eta, FRESH, seed + 1)
+    top = found.wanted.P if found.objective == "horizon" and found.wanted.P is not None else form.P
+    notes = list(leaving(increments))
+    if search.program.varies:
+        notes.insert(0, "outputs are not affine: they enter by a bound that is affine in their Jacobian")
+    if not search.cover.rigorous:
+        notes.insert(0, f"evidence, not proof: {len(search.points.A)} Jacobians, then {FRESH} fresh points, hold it")
+    worst = dict(zip(increments.names, v.tolist(), strict=True))
+    if second is not None:
+        worst |= {f"{name} of the second": value for name, value in zip(increments.names, second.tolist(), strict=True)}
+    return DetectabilityCertificate(
+        P_lower=form.P,
+        P_upper=top,
+        Q=form.W[0],
+        R=form.R,
+        eta=eta,
+        step=model.step,
+        method=search.cover.method,
+        rigorous=search.cover.rigorous,
+        margin=margin,
+        domain=domain or model.bounds,
+        worst=worst,
+        notes=tuple(notes),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """What is given and what is to be found."""
+
+    objective: str
+    eta: float | None
+    wanted: Wanted
+
+    def answer(self, search: Search) -> tuple[float, Form]:
+        """Return eta and the form."""
+        if self.objective not in ("rate", "horizon"):
+            assert self.eta is not None
+            return self.eta, search.form(self.eta, self.wanted)
+        eta, form = search.fastest(self.wanted)
+        if self.objective == "horizon" and self.wanted.P is not None:
+            eta, form = search.shortest(self.wanted, eta)
+        return eta, form
+
+
+def _asked(
+    model: Model, eta: float | None, rate: float | None, objective: str | None, P: Any, Q: Any, R: Any
+) -> _Asked:
+    what = "certify_detectability"
+    if eta is not None and rate is not None:
+        raise InputError(f"{what}: give eta or rate (-ln eta), not both")
+    if rate is not None:
+        if not (np.isfinite(rate) and rate > 0):
+            raise InputError(f"{what}: rate must be positive, per second or step, got {rate!r}")
+        eta = float(np.exp(-rate))
+    if eta is not None and not 0 < eta < 1:
+        raise InputError(f"{what}: eta must lie in (0, 1), a factor per second or step, got {eta!r}")
+    objective = objective or ("rate" if eta is None else "gain")
+    if objective not in OBJECTIVES:
+        raise InputError(f"{what}: objective must be one of {', '.join(OBJECTIVES)}, got {objective!r}")
+    if (objective in ("rate", "horizon")) == (eta is not None):
+        other = "finds eta: leave it out" if eta is not None else "needs eta= or rate="
+        raise InputError(f"{what}: objective {objective!r} {other}")
+    sizes = (("P", P, len(model.x)), ("Q", Q, len(model.w)), ("R", R, len(model.y)))
+    given = {
+        name: None if value is None else definite(as_matrix(value, n, name), name, zero=name != "P")
+        for name, value, n in sizes
+    }
+    if not len(model.w):
+        given["Q"] = np.zeros((0, 0))
+    if objective == "P" and (given["Q"] is None or given["R"] is None or given["P"] is not None):
+        raise InputError(f"{what}: objective 'P' needs Q= and R=, which P is measured by, and no P=")
+    kind = {"rate": "gain", "horizon": "gain" if P is None else "share"}.get(objective, objective)
+    limit = GAIN if objective in ("rate", "horizon", "conditioning") else None
+    return _Asked(objective, eta, Wanted(kind, given["P"], (given["Q"],), given["R"], limit=limit))
+
+
+class Search:
+    """Forms for a model whose domain is covered, verified at every Jacobian of the cover and at fresh points."""
+
+    def __init__(self, increments: Increments, cover: Cover, seed: int = 0):
+        self.increments, self.cover, self.points = increments, cover, cover.jacobians
+        self.sizes, self.seed = Sizes(Units.of(increments.model)), seed
+        self.program = Program(self.sizes, increments, cover.jacobians)
+        self.active = np.unique(np.linspace(0, len(self.points.A) - 1, FIRST).astype(int))
+
+    def form(self, eta: float, wanted: Wanted, *, quick: bool = False) -> Form:
+        """Return a form for eta that holds at all Jacobians, and at fresh points unless `quick`.
+
+        Jacobians and points where it fails join the program, the worst first.
+
+        Raises
+        ------
+        CertificateError
+        """
+        slacks = list(SLACKS)
+        for round_ in range(ROUNDS):
+            try:
+                form = self._solved(eta, replace(wanted, slack=slacks[0]))
+            except CertificateError as error:
+                why = None if quick else unseen_mode(self.increments, eta)
+                said = f": {why}. No weights help; try a slower rate" if why else f": {error}"
+                raise CertificateError(f"no quadratic function at eta = {eta:.6g}{said}") from None
+            margins = self.sizes.margins(form, eta, self.points)
+            failing = np.flatnonzero(margins < self._rounding(form))
+            new = np.setdiff1d(failing, self.active)
+            if len(new):
+                self.active = np.union1d(self.active, new[np.argsort(margins[new])[:6]])
+            elif len(failing):
+                if self._checked(wanted) or len(slacks) == 1:
+                    raise CertificateError(self._fails(form, eta))
+                slacks.pop(0)
+            elif quick:
+                return form
+            else:
+                margin, v, second = self.fresh(form, eta, FRESH, self.seed + 100 + round_)
+                if margin >= self._rounding(form):
+                    return form
+                if self.cover.rigorous or self._checked(wanted):
+                    raise CertificateError(self._fails(form, eta))
+                pair = self.increments.at(v) if second is None else self.increments.between(v, second)
+                self.points = Jacobians(*(np.concatenate(both) for both in zip(self.points, pair, strict=True)))
+                self.active = np.append(self.active, len(self.points.A) - 1)
+        raise CertificateError(self._fails(form, eta))
+
+    def fastest(self, wanted: Wanted) -> tuple[float, Form]:
+        """Return the smallest eta for which a form is found, to one per mille of -ln eta, and the form."""
+        pace, best, bracket = self.program.pace if self.program.pace else 1.0, None, [0.0, np.inf]
+        rate = 0.05 * (pace if not self.sizes.units.discrete else 1.0)
+        for _ in range(40):
+            try:
+                best = (rate, self.form(float(np.exp(-rate)), wanted, quick=True))
+                bracket[0] = rate
+            except CertificateError:
+                bracket[1] = rate
+            low, high = bracket
+            if high < 1e-7 * pace or (low > 0 and high / low < 1.001) or low > 500:
+                break
+            rate = rate / 8 if not low else rate * 4 if high == np.inf else float(np.sqrt(low * high))
+        if best is None:
+            why = unseen_mode(self.increments, 1.0)
+            raise CertificateError(
+                f"model {self.increments.model.name!r} has no quadratic function at any rate on this domain: "
+                + (
+                    f"it is not detectable: {why}"
+                    if why
+                    else "no mode of a linearisation shows why; try a smaller domain"
+                )
+            )
+        for share in (1.0, 0.999, 0.99, 0.9):  # fresh points may ask for less
+            eta = float(np.exp(-share * best[0]))
+            try:
+                return eta, self.form(eta, wanted)
+            except CertificateError as error:
+                last = error
+        raise last
+
+    def shortest(self, wanted: Wanted, fastest: float) -> tuple[float, Form]:
+        """Return eta and the form below the given P with the shortest horizon (3.30)."""
+
+        def horizon(log_rate: float) -> float:
+            try:
+                form = self.form(float(np.exp(-np.exp(log_rate))), wanted, quick=True)
+            except CertificateError:
+                return 1e9
+            return float(np.log(np.log(4 * eigh(wanted.P, form.P, eigvals_only=True)[-1])) - log_rate)
+
+        top = np.log(-np.log(fastest))
+        best: Any = minimize_scalar(horizon, bounds=(top - 5, top), method="bounded", options={"xatol": 1e-2})
+        eta = float(np.exp(-np.exp(best.x)))
+        return eta, self.form(eta, wanted)
+
+    def fresh(self, form: Form, eta: float, count: int, seed: int) -> tuple[float, Array, Array | None]:
+        """Return the smallest margin at fresh points of the domain, and where; the second point for nonlinear outputs.
+
+        Random ones and corners, then a local search from the worst of them.
+        """
+        rng, increments, varies = np.random.default_rng(seed), self.increments, self.program.varies
+
+        def margins(v: Array) -> Array:
+            first, second = v[:, 0], v[:, 1]
+            jacobians = increments.between(first, second) if varies else increments.at(first)
+            return self.sizes.margins(replace(form, N=None), eta, jacobians)
+
+        count = count // 4 if varies else count
+        v1, v2 = increments.random_pairs(count, rng)
+        v1, v2 = (np.vstack([part, increments.corners()]) for part in (v1, v2))
+        same = np.r_[tuple(np.arange(len(increments.names))[increments.place[key]] for key in "up")]
+        v2[:, same] = v1[:, same]
+        pool = np.stack([v1, v2], axis=1)
+        values = margins(pool)
+        width = increments.upper - increments.lower
+        width = np.where(np.isfinite(width), width, 0.0)
+        moves = np.isin(np.arange(len(width)), increments.varying) & (width > 0)
+        for radius in 0.3 * 0.6 ** np.arange(10 if moves.any() else 0):
+            keep = pool[np.argsort(values)[:6]]
+            steps = rng.normal(size=(20, *keep.shape)) * (radius * width * moves)
+            steps[:, :, 1, same] = steps[:, :, 0, same]
+            tried = np.clip(keep + steps, increments.lower, increments.upper).reshape(-1, *keep.shape[1:])
+            pool, values = np.concatenate([pool, tried]), np.concatenate([values, margins(tried)])
+        worst = int(np.argmin(values))
+        return float(values[worst]), pool[worst, 0], pool[worst, 1] if varies else None
+
+    def _checked(self, wanted: Wanted) -> bool:
+        return wanted.objective != "share" and all(part is not None for part in (wanted.P, *wanted.W, wanted.R))
+
+    def _solved(self, eta: float, wanted: Wanted) -> Form:
+        if self._checked(wanted) and not self.program.varies:
+            return Form(wanted.P, wanted.W, wanted.R)
+        return self.program.solve(self.points.take(self.active), eta, wanted)
+
+    def _rounding(self, form: Form) -> float:
+        scale = self.sizes.scale
+        sizes = np.abs(scale @ np.diag(np.zeros(len(scale))) @ scale).max(initial=0.0)
+        parts = (self.sizes.units.x @ form.P @ self.sizes.units.x, self.sizes.units.y @ form.R @ self.sizes.units.y)
+        return -ROUNDING * max(sizes, *(np.abs(part).max() for part in parts))
+
+    def _fails(self, form: Form, eta: float) -> str:
+        margin, v, _ = self.fresh(form, eta, FRESH, self.seed)
+        least = min(margin, float(self.sizes.margins(form, eta, self.points).min()))
+        where = f"; at fresh points by {-margin:.3g}, at {point(self.increments, v)}" if margin < 0 else ""
+        return (
+            f"the inequality fails at eta = {eta:.6g} by {-least:.3g} in nominal units on the cover "
+            f"({self.cover.method}){where}; try a slower rate, larger Q and R, or a smaller domain"
+        )
