@@ -17,50 +17,10 @@ import numpy as np
 
 from ctmhe.certificates.certificate import DetectabilityCertificate, largest_ratio
 from ctmhe.certificates.increments import Increments
+from ctmhe.certificates.observers import ObserverFunction
 from ctmhe.errors import InputError
 from ctmhe.models.continuous import Model
-from ctmhe.types import Array, Bounds, frozen
-
-
-@dataclass(frozen=True, eq=False)
-class ObserverFunction:
-    """V_o of Assumption 4.2, an i-ISS Lyapunov function of an observer z against the state x.
-
-    |z - x|^2_P_lower <= V_o <= |z - x|^2_P_upper (4.6a) and V_o+ <= eta V_o + |d|^2_Q + |v|^2_R (4.6b), where d are the
-    disturbances that enter the dynamics and v those of the outputs; in continuous time dV_o/dt <= ln(eta) V_o + ...
-
-    Parameters
-    ----------
-    P_lower, P_upper : array (nx, nx)
-    Q : array (nd, nd), R : array (nv, nv)
-    eta : float in (0, 1)
-        Per step, or second.
-    """
-
-    P_lower: Array
-    P_upper: Array
-    Q: Array
-    R: Array
-    eta: float
-
-    def __post_init__(self) -> None:
-        for name in ("P_lower", "P_upper", "Q", "R"):
-            matrix = np.atleast_2d(np.array(getattr(self, name), dtype=float))
-            if len(matrix) and not (np.allclose(matrix, matrix.T) and np.linalg.eigvalsh(matrix)[0] > 0):
-                raise InputError(f"ObserverFunction: {name} must be symmetric and positive definite, got {matrix}")
-            object.__setattr__(self, name, frozen(matrix))
-        if not 0 < self.eta < 1:
-            raise InputError(f"ObserverFunction: eta must lie in (0, 1), got {self.eta}")
-
-    @property
-    def ratio(self) -> float:
-        """lambda_max(P_upper, P_lower)."""
-        return max(largest_ratio(self.P_upper, self.P_lower), 1.0)
-
-    def scaled(self, factor: float) -> ObserverFunction:
-        """Return the same for factor V_o."""
-        parts = (factor * part for part in (self.P_lower, self.P_upper, self.Q, self.R))
-        return ObserverFunction(*parts, eta=self.eta)
+from ctmhe.types import Array, Bounds
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from ctmhe.certificates.excited_set import ExcitedSet
 from ctmhe.certificates.horizon import aligned, contraction, longest_wait, shortest_horizon, smallest_horizon
 from ctmhe.certificates.joint_horizons import joint_conditions, joint_horizon
 from ctmhe.certificates.joint_weights import StateDetectability, joint_weights
+from ctmhe.certificates.observers import ObserverFunction
 from ctmhe.certificates.suboptimal_horizons import (
     Lipschitz,
-    ObserverFunction,
     cost_factor,
     gamma_1,
     growth,
