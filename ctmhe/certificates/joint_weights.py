@@ -147,8 +147,8 @@ class JointWeights:
     eta_p: float
     ratio: float
 
-    def gamma(self, s: float) -> float:
-        """Return gamma(s) of (5.10)."""
+    def gamma(self, s: Any) -> Any:
+        """Return gamma(s) of (5.10), s a number or an array."""
         return self.eta_x**s + self.ratio * self.eta_p**s
 
 

@@ -22,6 +22,8 @@ from ctmhe.models.library import (
     cstr_steady_states,
     hover_speed,
     quadrotor,
+    three_species,
+    three_species_discrete,
     van_der_pol,
 )
 
@@ -31,6 +33,7 @@ PLANTS = {
     "chua": lambda **k: chua(parameters=("p", "a1", "a2", "b1", "b2"), **k),
     "cstr": lambda **k: cstr(parameters=("F0", "T0", "c0", "r", "k0", "E_R", "U", "rho", "Cp", "DeltaH"), **k),
     "quadrotor": quadrotor,
+    "three_species": lambda **k: three_species(parameters=("p1", "p2", "p3", "p4"), **k),
     "van_der_pol": lambda **k: van_der_pol(parameters=("mu",), **k),
 }
 NO_PARAMETERS = {
@@ -39,6 +42,7 @@ NO_PARAMETERS = {
     "chua": lambda **k: chua(parameters=(), **k),
     "cstr": cstr,
     "quadrotor": quadrotor,
+    "three_species": three_species,
     "van_der_pol": van_der_pol,
 }
 every_plant = pytest.mark.parametrize("plant", PLANTS)
@@ -152,10 +156,17 @@ def test_every_quantity_with_a_unit_carries_it(plant):
     assert model.source
 
 
-@pytest.mark.parametrize("plant", [batch_reactor, chua, cstr, van_der_pol, cascaded_tanks])
+@pytest.mark.parametrize("plant", [batch_reactor, chua, cstr, van_der_pol, cascaded_tanks, three_species])
 def test_unknown_and_repeated_parameters_raise(plant):
     """A parameter is chosen by its name, once."""
-    known = {batch_reactor: "k1", chua: "a1", cstr: "DeltaH", van_der_pol: "mu", cascaded_tanks: "rim"}[plant]
+    known = {
+        batch_reactor: "k1",
+        chua: "a1",
+        cstr: "DeltaH",
+        van_der_pol: "mu",
+        cascaded_tanks: "rim",
+        three_species: "p3",
+    }[plant]
     with pytest.raises(InputError, match=f"unknown parameter '{known}x'; did you mean '{known}'"):
         plant(parameters=(known + "x",))
     with pytest.raises(InputError, match=re.escape(f"parameters must differ, got {known}, {known}")):
@@ -206,6 +217,45 @@ def test_reactor_conserves_the_substance_and_ends_at_its_equilibrium():
     pA = np.roots([2 * 0.16, 0.0064, -5 * 0.0064]).max()
     np.testing.assert_allclose(run.y[:, -1], [pA, (5 - pA) / 2], rtol=1e-8)
     np.testing.assert_allclose(evaluate(f, [pA, (5 - pA) / 2]), 0.0, atol=1e-15)
+
+
+# --- three species --------------------------------------------------------------------------------------------
+
+concentration = st.floats(0.0, 3.0)
+
+
+@given(cA=concentration, cB=concentration, cC=concentration)
+def test_three_species_follow_the_mass_action_of_their_stoichiometry(cA, cB, cC):
+    """dx/dt = stoichiometric matrix times (forward rates - backward rates); 3 cA + cB + 2 cC does not change."""
+    stoichiometry = np.array([[-1.0, 0.0], [1.0, -2.0], [1.0, 1.0]])
+    expected = stoichiometry @ [0.2 * cA - 0.05 * cB * cC, 0.2 * cB * cB - 0.1 * cC]
+    found = evaluate(three_species().dynamics, [cA, cB, cC])
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)
+    assert found @ [3.0, 1.0, 2.0] == pytest.approx(0.0, abs=1e-14)
+
+
+def test_three_species_euler_step_is_the_published_map():
+    """x + 0.25 f(x) + d is (4.70), term by term."""
+    (a, b, c), d = (1.3, 0.4, 0.7), np.array([1e-3, -2e-3, 3e-3])
+    published = [
+        a + 0.25 * (-0.2 * a + 0.05 * b * c) + d[0],
+        b + 0.25 * (0.2 * a - 0.05 * b * c - 2 * 0.2 * b**2 + 2 * 0.1 * c) + d[1],
+        c + 0.25 * (0.2 * a - 0.05 * b * c + 0.2 * b**2 - 0.1 * c) + d[2],
+    ]
+    model = three_species_discrete()
+    np.testing.assert_allclose(evaluate(model.dynamics, [a, b, c], w=[*d, 0.01]), published, rtol=1e-13)
+    assert evaluate(model.output, [a, b, c], w=[*d, 0.01])[0] == pytest.approx(a + b + c + 0.01)
+    assert model.step == 0.25
+
+
+def test_three_species_stay_positive_and_end_at_the_equilibrium_of_both_reactions():
+    """From (0.5, 0.05, 0.1) both rates fade; what is conserved decides where."""
+    f = three_species().dynamics
+    run = solve_ivp(lambda t, x: evaluate(f, x), (0, 500), [0.5, 0.05, 0.1], rtol=1e-10, atol=1e-12, method="LSODA")
+    assert run.y.min() > 0
+    a, b, c = run.y[:, -1]
+    np.testing.assert_allclose([0.2 * a, 0.2 * b**2], [0.05 * b * c, 0.1 * c], rtol=1e-7)
+    assert 3 * a + b + 2 * c == pytest.approx(1.75)
 
 
 # --- quadrotor ----------------------------------------------------------------------------------------------

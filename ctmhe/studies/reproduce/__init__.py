@@ -11,11 +11,19 @@ from ctmhe.studies.reproduce import (
     study_solves_saved,
     thesis_3_4_1_certificate,
     thesis_3_4_1_ct,
+    thesis_4_3_3_horizons,
+    thesis_5_2_4_horizon,
+    thesis_table_3_2,
+    thesis_table_4_2,
 )
 
 CASES: dict[str, Callable[..., dict[str, Any]]] = {
     "thesis-3.4.1-ct": thesis_3_4_1_ct.reproduce,
     "thesis-3.4.1-certificate": thesis_3_4_1_certificate.reproduce,
+    "thesis-table-3.2": thesis_table_3_2.reproduce,
+    "thesis-table-4.2": thesis_table_4_2.reproduce,
+    "thesis-4.3.3-horizons": thesis_4_3_3_horizons.reproduce,
+    "thesis-5.2.4-horizon": thesis_5_2_4_horizon.reproduce,
     "study-reactor-budget": study_reactor_budget.reproduce,
     "study-solves-saved": study_solves_saved.reproduce,
 }
