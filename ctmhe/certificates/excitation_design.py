@@ -37,6 +37,9 @@ from ctmhe.models.continuous import Model
 from ctmhe.types import Array, Bounds, frozen, positive
 
 FRESH = 400
+FASTEST = 500.0
+"""Rate per second; what fades faster than by exp(-500) is zero for a computer."""
+
 SEEN = 0.02
 """What shows less in y, both in nominal units, is worth a word when there is no design."""
 
@@ -98,6 +101,11 @@ def design_excitation(
     fixed = linear and constant(points.A @ unseen)
     pace = units.pace(centre)
     T = 200.0 / pace if horizon is None else positive("design_excitation: horizon", horizon)
+    if not units.discrete and 1.1 * np.log(4) / T > FASTEST:
+        raise InputError(
+            f"design_excitation: to contract within {T:.2g} s, W would have to fade by less than exp(-{FASTEST:g}) per "
+            "second; give a longer horizon=, or a model that counts milliseconds"
+        )
     samples = increments.at(increments.random(64, np.random.default_rng(2)))
 
     def attempt(factor: float, least: float, speed: float) -> tuple[float, Any]:
@@ -111,7 +119,7 @@ def design_excitation(
     for round_, (least, speed) in enumerate(zip(SLACKS, SPEEDS, strict=True)):
         try:
             if chosen is None:
-                slowest, fastest = 1.1 * np.log(4) / T, min(pace, 4.0) if units.discrete else pace
+                slowest, fastest = 1.1 * np.log(4) / T, min(pace, 4.0 if units.discrete else FASTEST)
                 chosen = _best_factor(lambda factor: attempt(factor, SLACKS[0], speed)[0], slowest, fastest)  # noqa: B023
             P, Q, R, L = attempt(chosen, least, speed)[1]
         except CertificateError as error:
