@@ -58,9 +58,16 @@ class Information:
     nominal: Array
 
     @property
+    def _in_nominals(self) -> Array:
+        return self.nominal[:, None] * self.matrix * self.nominal
+
+    @property
     def level(self) -> float:
-        """alpha_t, the smallest eigenvalue of the matrix."""
-        return float(np.linalg.eigvalsh(self.matrix)[0])
+        """alpha_t: the smallest eigenvalue of the matrix, for parameters in units of their nominals.
+
+        So it does not depend on the parameters' units. That of `matrix` itself is the thesis'.
+        """
+        return float(np.linalg.eigvalsh(self._in_nominals)[0])
 
     @property
     def directions(self) -> tuple[Direction, ...]:
@@ -69,7 +76,7 @@ class Information:
         Eigenvectors of the matrix for parameters in units of their nominals; which combinations are excited when the
         level says that some are not.
         """
-        values, vectors = np.linalg.eigh(self.nominal[:, None] * self.matrix * self.nominal)
+        values, vectors = np.linalg.eigh(self._in_nominals)
         signs = np.sign(vectors[np.abs(vectors).argmax(axis=0), np.arange(len(values))])
         named = (dict(zip(self.parameters, map(float, column), strict=True)) for column in (vectors * signs).T)
         pairs = zip(values, named, strict=True)
@@ -77,7 +84,7 @@ class Information:
 
     def excited(self, alpha: float) -> Array:
         """Return a basis (np, k) of the combinations, of nominal parameters, whose level is at least alpha."""
-        values, vectors = np.linalg.eigh(self.nominal[:, None] * self.matrix * self.nominal)
+        values, vectors = np.linalg.eigh(self._in_nominals)
         return vectors[:, values >= alpha]
 
 

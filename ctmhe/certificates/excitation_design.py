@@ -37,6 +37,11 @@ from ctmhe.models.continuous import Model
 from ctmhe.types import Array, Bounds, frozen, positive
 
 FRESH = 400
+FASTEST = 500.0
+"""Rate per second; what fades faster than by exp(-500) is zero for a computer."""
+
+SEEN = 0.02
+"""What shows less in y, both in nominal units, is worth a word when there is no design."""
 
 
 def design_excitation(
@@ -96,6 +101,11 @@ def design_excitation(
     fixed = linear and constant(points.A @ unseen)
     pace = units.pace(centre)
     T = 200.0 / pace if horizon is None else positive("design_excitation: horizon", horizon)
+    if not units.discrete and 1.1 * np.log(4) / T > FASTEST:
+        raise InputError(
+            f"design_excitation: to contract within {T:.2g} s, W would have to fade by less than exp(-{FASTEST:g}) per "
+            "second; give a longer horizon=, or a model that counts milliseconds"
+        )
     samples = increments.at(increments.random(64, np.random.default_rng(2)))
 
     def attempt(factor: float, least: float, speed: float) -> tuple[float, Any]:
@@ -109,7 +119,7 @@ def design_excitation(
     for round_, (least, speed) in enumerate(zip(SLACKS, SPEEDS, strict=True)):
         try:
             if chosen is None:
-                slowest, fastest = 1.1 * np.log(4) / T, min(pace, 4.0) if units.discrete else pace
+                slowest, fastest = 1.1 * np.log(4) / T, min(pace, 4.0 if units.discrete else FASTEST)
                 chosen = _best_factor(lambda factor: attempt(factor, SLACKS[0], speed)[0], slowest, fastest)  # noqa: B023
             P, Q, R, L = attempt(chosen, least, speed)[1]
         except CertificateError as error:
@@ -133,7 +143,7 @@ def design_excitation(
         )
         if not cover.rigorous:  # samples are refined where they were too few
             points = Jacobians(*(np.concatenate(parts) for parts in zip(points, met, strict=True)))
-    raise CertificateError(f"design_excitation: {_why_not(centre, chosen, units.discrete, model)}{failure}")
+    raise CertificateError(f"design_excitation: {_why_not(increments, chosen)}{failure}")
 
 
 def _cover(increments: Increments) -> tuple[Cover, tuple[str, ...]]:
@@ -173,15 +183,28 @@ def _best_factor(score_of: Any, slowest: float, fastest: float) -> float:
     return float(np.exp(-np.exp(found.x) if found.fun < scores[best] else -rates[best]))
 
 
-def _why_not(centre: Jacobians, mu: float | None, discrete: bool, model: Model) -> str:
-    """Return a sentence that names a mode which is not seen and fades too slowly, if the centre has one."""
-    A, C = centre.A[0], centre.C[0]
-    limit = np.sqrt(mu or 1.0) if discrete else np.log(mu or 1.0) / 2
-    for value, mode in zip(*[part.T for part in np.linalg.eig(A)], strict=True):
-        if (abs(value) if discrete else value.real) >= limit and np.linalg.norm(C @ mode) < 1e-8 * np.linalg.norm(C):
-            parts = ", ".join(f"{name} {abs(part):.2g}" for name, part in zip(model.x.names, mode, strict=True))
-            return f"outputs do not see the mode ({parts}) with eigenvalue {value:.3g}, which fades too slowly; "
-    return ""
+def _why_not(increments: Increments, mu: float | None) -> str:
+    """Return a sentence on the mode that is seen least of those that fade too slowly, where it is hardly seen.
+
+    By the Popov-Belevitch-Hautus test at points of the domain, the centre first: no L moves a mode that is unseen.
+    """
+    model, units = increments.model, Units.of(increments.model)
+    v = np.vstack([increments.centre, increments.random(FRESH, np.random.default_rng(7)), increments.corners()])
+    jacobians = units.scaled(increments.at(v))
+    limit, n, worst = (mu or 1.0) ** 0.5, len(model.x), (SEEN, np.zeros(len(model.x)), 0.0, v[0])
+    for point, A, C in zip(v, jacobians.A, jacobians.C, strict=True):
+        size = np.linalg.norm(A, 2) or 1.0
+        for value in np.linalg.eigvals(A):
+            if (abs(value) if units.discrete else np.exp(value.real)) >= limit:
+                _, seen, modes = np.linalg.svd(np.vstack([(A - value * np.eye(n)) / size, C]))
+                if seen[-1] < worst[0] * (1 - 1e-6):
+                    worst = (float(seen[-1]), np.abs(modes[-1]), value, point)
+    if worst[0] >= SEEN:
+        return ""
+    parts = ", ".join(f"{name} {part:.2g}" for name, part in zip(model.x.names, worst[1], strict=True))
+    where = ", ".join(f"{increments.names[i]} = {worst[3][i]:.3g}" for i in increments.varying)
+    how = "do not see" if worst[0] < 1e-8 else "hardly see"
+    return f"outputs {how} the mode ({parts}) with eigenvalue {worst[2]:.3g}, which fades too slowly at {where}; "
 
 
 def _follows_one(increments: Increments, compensated: bool) -> bool:
@@ -229,14 +252,18 @@ def regressor_bound(made: ExcitationDesign) -> Array | None:
 
 
 def filter_bounds(made: ExcitationDesign) -> tuple[float, float]:
-    """Return bounds of |Y v|_P / |v| and |S| along pairs that start with zero: (7.78) at its best eps3, (7.85)."""
+    """Return bounds of |Y v|_P and |v|^2_S along pairs that start with zero: (7.78) at its best eps3, (7.85).
+
+    For |v| = 1, v being parameters over their nominals.
+    """
+    nominal = Units.of(made.model).p
     points, other = _cover(made.increments)[0].jacobians, made.increments.cover("EF").jacobians
     L = made.injection(points.A)
     forces = (other.E[:, None] + L[None] @ other.F[:, None]).reshape(-1, *other.E.shape[1:])
-    force = np.sqrt(max(np.linalg.eigvalsh(G.T @ made.P @ G)[-1] for G in forces))
+    force = np.sqrt(max(np.linalg.eigvalsh(G.T @ made.P @ G)[-1] for G in forces @ nominal))
     Y = force / (1 - np.sqrt(made.eta)) if made.discrete else -2 * force / np.log(made.eta)
     seen = np.sqrt(max(eigh(C.T @ C, made.P, eigvals_only=True)[-1] for C in points.C))
-    feed = max(np.linalg.norm(F, 2) for F in other.F)
+    feed = max(np.linalg.norm(F, 2) for F in other.F @ nominal)
     return float(Y), float((seen * Y + feed) ** 2 / ((1 - made.mu) if made.discrete else -np.log(made.mu)))
 
 
@@ -247,7 +274,8 @@ def _drift(made: ExcitationDesign, B_p: Array) -> Drift:
     |B_p dw|^2_S); in continuous time 2 |z'P Y B_p dw| + 2 |dp'S B_p dw| <= e W + (1/e) (the same).
     """
     (Y, S), mu, rate = filter_bounds(made), made.mu, -np.log(made.mu)
-    added = (Y**2 + S) * B_p.T @ B_p
+    share = np.linalg.solve(Units.of(made.model).p, B_p)
+    added = (Y**2 + S) * share.T @ share
     if made.discrete:
         contraction = (1 + mu) / 2
         e = contraction / mu - 1

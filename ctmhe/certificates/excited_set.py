@@ -36,6 +36,8 @@ class ExcitedSet:
 class Drift:
     """W+ <= mu W + |dw|^2_Q + |dy|^2_R for parameters that vary, p+ = p + B_p w (7.73b) or dp/dt = B_p w.
 
+    |v| is of parameters over their nominals.
+
     Attributes
     ----------
     B_p : array (np, nw)
@@ -45,7 +47,7 @@ class Drift:
     Y : float
         |Y v|_P <= Y |v| along every pair: (7.78) with its best eps3.
     S : float
-        |S| <= S (7.85).
+        |v|^2_S <= S |v|^2 (7.85).
     """
 
     B_p: Array
@@ -141,26 +143,26 @@ class ExcitationDesign:
         return slack(Units.of(self.model), self.mu, weights, self.injection(jacobians.A), jacobians)
 
     def excited_set(self, alpha: float, *, horizon: float | None = None) -> ExcitedSet:
-        """Return the matrices of E_T for pairs whose information C_T is at least alpha I (7.44), (7.75).
+        """Return the matrices of E_T for pairs whose information C_T has at least the level alpha (7.44), (7.75).
 
         Parameters
         ----------
         alpha : float
-            In y's units squared over p's.
+            In y's units squared, of parameters over their nominals.
         horizon : float
             T, in steps or seconds; only where parameters vary, and always there. The thesis' matrices for that case do
             not depend on it, but the last step of its proof drops squares: |dp(0)|^2 <= 2 |dp(T)|^2 + 2 T sum of
             |B_p dw|^2.
         """
         alpha = positive("excited_set: alpha", alpha)
-        S = alpha * np.eye(len(self.model.p))
+        S = alpha * np.linalg.inv(Units.of(self.model).p ** 2)
         drift = self.drift
         if drift is None:
             if horizon is not None:
                 raise InputError("excited_set: with constant parameters the matrices do not depend on T; omit horizon")
             return ExcitedSet(frozen(S), self.P, self.Q, self.R, self.mu)
         T = positive("excited_set: horizon", horizon, "steps" if self.discrete else "seconds")
-        Q = drift.Q + alpha * T * drift.B_p.T @ drift.B_p
+        Q = drift.Q + T * drift.B_p.T @ S @ drift.B_p
         return ExcitedSet(frozen(S / 2), self.P, frozen(Q), drift.R, drift.mu)
 
     def __str__(self) -> str:

@@ -155,8 +155,9 @@ class Increments:
         return Jacobians(second.A, second.B, first.E, second.C, second.D, first.F)
 
     def _mean(self, start: Array, end: Array) -> Jacobians:
-        parts = [self.at(start + s * (end - start)) for s in NODES]
-        return Jacobians(*(np.tensordot(WEIGHTS, np.stack(part), 1) for part in zip(*parts, strict=True)))
+        found = self.at(np.vstack([start + s * (end - start) for s in NODES]))
+        shape = (len(NODES), len(start))
+        return Jacobians(*(np.tensordot(WEIGHTS, part.reshape(*shape, *part.shape[1:]), 1) for part in found))
 
     @property
     def centre(self) -> Array:

@@ -93,7 +93,8 @@ class JointCertificate:
         largest = float(eigh(self.M_0, M, eigvals_only=True)[-1])
         length = float(trajectory.t[-1] - trajectory.t[0])
         T = round(length / self.design.model.step) if self.design.model.step else length
-        alpha = float(np.linalg.eigvalsh(found.undiscounted)[0])
+        nominal = Units.of(self.design.model).p
+        alpha = float(np.linalg.eigvalsh(nominal @ found.undiscounted @ nominal)[0])
         limit = self.kappa if kappa is None else positive("check: kappa", kappa)
         return OnlineConditions(largest, limit, alpha, self.alpha, self.rho(T, largest))
 
@@ -108,7 +109,7 @@ class OnlineConditions:
         lambda_max(M_0, M) at its end; (33) is `kappa <= kappa_limit`.
     kappa_limit : float
     alpha : float
-        Smallest eigenvalue of the undiscounted sum; (34) is `alpha > alpha_limit`. Implied by (33) if S_0 > 0; kept
+        Level of the undiscounted sum; (34) is `alpha > alpha_limit`. Implied by (33) if S_0 > 0; kept
         since it tells excitation from memory.
     alpha_limit : float
     rho : float
@@ -143,9 +144,9 @@ def certify_jointly(design: ExcitationDesign, *, alpha: float, S_0: Any = None) 
     design : ExcitationDesign
         With constant parameters.
     alpha : float
-        In y's units squared over p's; what `ExcitationMonitor` finds on the trajectories that are expected.
+        A level in y's units squared; what `ExcitationMonitor` finds on the trajectories that are expected.
     S_0 : array (np, np), optional
-        Weight of the parameters' prior in (7), positive definite; alpha I when left out. The smaller, the less a wrong
+        Weight of the parameters' prior in (7), positive definite; of level alpha when left out. The smaller, the less a wrong
         prior counts and the faster U contracts.
 
     Raises
@@ -155,14 +156,15 @@ def certify_jointly(design: ExcitationDesign, *, alpha: float, S_0: Any = None) 
     """
     if design.drift is not None:
         raise InputError("certify_jointly: Theorem 10 is for constant parameters; design without B_p")
-    alpha, o = positive("certify_jointly: alpha", alpha), len(design.model.p)
-    S_0 = alpha * np.eye(o) if S_0 is None else np.array(S_0, dtype=float)
+    alpha, o, nominal = positive("certify_jointly: alpha", alpha), len(design.model.p), Units.of(design.model).p
+    one = np.linalg.inv(nominal**2)  # weight of parameters over their nominals
+    S_0 = alpha * one if S_0 is None else np.array(S_0, dtype=float)
     if S_0.shape != (o, o) or not np.allclose(S_0, S_0.T) or np.linalg.eigvalsh(S_0)[0] <= 0:
         raise InputError(f"certify_jointly: S_0 must be a symmetric positive definite ({o}, {o}) matrix, got {S_0}")
-    size, largest = filter_bounds(design)[0], float(np.linalg.eigvalsh(S_0)[-1])
+    size, largest = filter_bounds(design)[0], float(np.linalg.eigvalsh(nominal @ S_0 @ nominal)[-1])
 
     def factor(share: float) -> float:
-        """|dx - Y dp|^2_P >= share |dx|^2_P - share / (1 - share) |Y dp|^2_P, by Young's inequality."""
+        """kappa, as |dx - Y dp|^2_P >= share |dx|^2_P - share / (1 - share) |Y dp|^2_P by Young's inequality."""
         rest = alpha - share / (1 - share) * size**2
         return max(1 / share, largest / rest) if rest > 0 else np.inf
 
@@ -171,7 +173,7 @@ def certify_jointly(design: ExcitationDesign, *, alpha: float, S_0: Any = None) 
         lambda s: np.log(min(factor(top * s), 1e300)), bounds=(1e-9, 1 - 1e-9), method="bounded"
     )
     share = top * float(found.x)
-    M_lower = block_diag(share * design.P, (alpha - share / (1 - share) * size**2) * np.eye(o))
+    M_lower = block_diag(share * design.P, (alpha - share / (1 - share) * size**2) * one)
     M_0 = block_diag(design.P, S_0)
     kappa = float(eigh(M_0, M_lower, eigvals_only=True)[-1])
     horizon = np.log(4 * kappa) / -np.log(design.mu)

@@ -29,7 +29,7 @@ class ExcitationMeasure(Protocol):
 class WindowExcitation:
     """The level alpha_t (7.62) of the last estimate's window, continued to now without disturbance.
 
-    Zero before the first estimate. In y's units squared over p's; see `ExcitationMonitor` for what it promises.
+    Zero before the first estimate. In y's units squared; see `ExcitationMonitor` for what it promises.
 
     Parameters
     ----------

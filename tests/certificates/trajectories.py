@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from scipy.integrate import solve_ivp
 
@@ -18,6 +20,11 @@ def quadratic(weight, v):
 
 def rate(model, x, u, w, p):
     return np.asarray(model.dynamics(0.0, x, u, w, p)).ravel()
+
+
+@cache
+def domain(model) -> Increments:
+    return Increments(model, u=(-1, 1))
 
 
 def inside(model, run: Trajectory) -> bool:
@@ -37,10 +44,7 @@ def trajectory(model, steps, rng, *, x=None, **given) -> Trajectory:
 
 def one_trajectory(model, steps, rng, *, h=None, size=1.0, x=None, p=None, u=None, w=None, B_p=None) -> Trajectory:
     """A trajectory from a random start of the domain, with w of `size` times the domain, held over slots of h."""
-    increments, h = (
-        Increments(model, Bounds(**{k: getattr(model.bounds, k) for k in "xwp"}), u=(-1, 1)),
-        model.step or h,
-    )
+    increments, h = domain(model), model.step or h
     start = increments.random(1, rng)[0]
     x = start[increments.place["x"]] if x is None else np.asarray(x, float)
     p = start[increments.place["p"]] if p is None else np.asarray(p, float)
