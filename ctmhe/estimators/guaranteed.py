@@ -117,7 +117,7 @@ def _unmet(own: DetectabilityCertificate, mhe: MHE) -> list[str]:
     if abs(steps[0] - steps[1]) > 1e-9 * steps[0]:
         times = [f"steps of {step:g} s" if step else "continuous time" for step in steps]
         problems.append(f"the certificate is for {times[0]}, the model in {times[1]}")
-    pointed = [name for name, kind in mhe.hold.items() if kind == "point"]
+    pointed = [name for name, kind in mhe.hold.items() if kind == "point" and model.step is None]
     if pointed:
         problems.append(f"single samples of {', '.join(pointed)}: the theory needs the whole signal")
     if mhe.assembly.filtering:

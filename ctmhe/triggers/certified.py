@@ -41,7 +41,7 @@ class Certified(Or):
         Of the estimator, seconds.
     wait : float, optional
         A shorter longest wait in seconds; the shorter, the faster the guaranteed decay `rho`. Nine tenths of what
-        (3.29) allows when left out.
+        (3.29) allows when left out, in whole steps of a discrete model.
 
     Raises
     ------
@@ -60,7 +60,11 @@ class Certified(Or):
                 f"Certified: a horizon of {self.horizon:g} s guarantees nothing: it must exceed "
                 f"{certificate.shortest_horizon() * unit:.4g} s, and the longest wait on top of it (3.30)"
             )
-        self.wait = 0.9 * self.limit if wait is None else positive(wait, "Certified: wait")
+        if wait is None:
+            wait = 0.9 * self.limit
+            if certificate.step is not None:
+                wait = max(np.floor(wait / certificate.step), 1.0) * certificate.step
+        self.wait = positive(wait, "Certified: wait")
         if self.wait >= self.limit:
             raise InputError(
                 f"Certified: with a horizon of {self.horizon:g} s the wait must stay below {self.limit:.4g} s (3.29), "

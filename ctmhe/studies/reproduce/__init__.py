@@ -7,6 +7,7 @@ from typing import Any
 
 from ctmhe.errors import InputError
 from ctmhe.studies.reproduce import (
+    certified_runs,
     study_reactor_budget,
     study_solves_saved,
     thesis_3_4_1_certificate,
@@ -24,6 +25,7 @@ CASES: dict[str, Callable[..., dict[str, Any]]] = {
     "thesis-table-4.2": thesis_table_4_2.reproduce,
     "thesis-4.3.3-horizons": thesis_4_3_3_horizons.reproduce,
     "thesis-5.2.4-horizon": thesis_5_2_4_horizon.reproduce,
+    "certified-runs": certified_runs.reproduce,
     "study-reactor-budget": study_reactor_budget.reproduce,
     "study-solves-saved": study_solves_saved.reproduce,
 }
