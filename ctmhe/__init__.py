@@ -2,6 +2,7 @@
 
 from importlib.metadata import PackageNotFoundError, version
 
+from ctmhe.certificates.guarantee import Guarantee
 from ctmhe.data import MeasurementLog
 from ctmhe.errors import CtmheError, FmuError, InputError, MissingExtra, ModelError, NotEstimated, TooLate, TriggerError
 from ctmhe.estimators import MHE, Prediction, State
@@ -25,7 +26,9 @@ from ctmhe.simulation import (
 from ctmhe.studies import Study, StudyResult, explore, find_threshold, latin_hypercube, pareto_front, sobol
 from ctmhe.transcription import CVODES, RK4
 from ctmhe.triggers import (
+    BoundSelfTriggered,
     Budget,
+    Certified,
     CovarianceBound,
     CovarianceSelfTriggered,
     Deadband,
@@ -65,8 +68,10 @@ __all__ = [
     "CVODES",
     "MHE",
     "RK4",
+    "BoundSelfTriggered",
     "Bounds",
     "Budget",
+    "Certified",
     "ContinuousModel",
     "CovarianceBound",
     "CovarianceSelfTriggered",
@@ -84,6 +89,7 @@ __all__ = [
     "FmuPlant",
     "Gaussian",
     "GeometricGaps",
+    "Guarantee",
     "Hysteresis",
     "Innovation",
     "InnovationEnergy",

@@ -276,8 +276,9 @@ def reproduce(*, seeds: int = 7, workers: int = 1, progress: bool = False, trial
 
 COMMENT = (
     "A ratio is the left over the right side with the true error and the true disturbance, noise that makes up for the "
-    "held output included: window_ratio of (3.20), at its worst along the window's piece of the trajectory, theorem_ratio "
-    "of (3.32). At t = 0 both are 0.25 by their factor 4; late_ ones count solves after the first horizon. online_ratio "
-    "compares the squared error with the bound that Estimate.bound gives without knowing the truth. The controls show "
-    "that the bounds can be broken: at |w| <= 1e-3 and w = 0 open loop and the constant guess break them."
+    "held output included: window_ratio of (3.20), at its worst along the window's piece of the trajectory, "
+    "theorem_ratio of (3.32). At t = 0 both are 0.25 by their factor 4; late_ ones count solves after the first "
+    "horizon. online_ratio compares the squared error with the bound that Estimate.bound gives without knowing the "
+    "truth. The controls show that the bounds can be broken: at |w| <= 1e-3 and w = 0 open loop and the constant guess "
+    "break them."
 )
