@@ -20,7 +20,7 @@ from ctmhe.types import Array, Bounds
 
 OBJECTIVES = ("gain", "rate", "P", "conditioning", "horizon")
 SLACKS = (1e-7, 1e-6, 1e-5, 1e-4)
-FRESH, FIRST, ROUNDS = 2000, 24, 25
+FRESH, FIRST, ROUNDS = 2000, 8, 25
 ROUNDING = 1e-12
 """Of the largest entry: an eigenvalue that is not below its negative is taken for zero."""
 
@@ -85,16 +85,16 @@ def certify_detectability(
     demand_continuity(increments)
     search = Search(increments, jacobians or increments.cover("ABCD"), seed)
     eta, form = found.answer(search)
-    margin, v, second = search.fresh(form, eta, FRESH, seed + 1)
+    values, pairs = search.fresh(form, eta, FRESH, seed + 1)
     top = found.wanted.P if found.objective == "horizon" and found.wanted.P is not None else form.P
     notes = list(leaving(increments))
     if search.program.varies:
         notes.insert(0, "outputs are not affine: they enter by a bound that is affine in their Jacobian")
     if not search.cover.rigorous:
         notes.insert(0, f"evidence, not proof: {len(search.points.A)} Jacobians, then {FRESH} fresh points, hold it")
-    worst = dict(zip(increments.names, v.tolist(), strict=True))
-    if second is not None:
-        worst |= {f"{name} of the second": value for name, value in zip(increments.names, second.tolist(), strict=True)}
+    worst = dict(zip(increments.names, pairs[0, 0].tolist(), strict=True))
+    if search.program.varies:
+        worst |= {f"{name} (second)": value for name, value in zip(increments.names, pairs[0, 1].tolist(), strict=True)}
     return DetectabilityCertificate(
         P_lower=form.P,
         P_upper=top,
@@ -104,7 +104,7 @@ def certify_detectability(
         step=model.step,
         method=search.cover.method,
         rigorous=search.cover.rigorous,
-        margin=margin,
+        margin=float(values[0]),
         domain=domain or model.bounds,
         worst=worst,
         notes=tuple(notes),
@@ -170,6 +170,9 @@ class Search:
         self.sizes, self.seed = Sizes(Units.of(increments.model)), seed
         self.program = Program(self.sizes, increments, cover.jacobians)
         self.active = np.unique(np.linspace(0, len(self.points.A) - 1, FIRST).astype(int))
+        if not cover.rigorous:
+            v = np.vstack([increments.random(FRESH, np.random.default_rng(seed)), increments.corners()])
+            self.points = _joined(self.points, increments.at(v))
 
     def form(self, eta: float, wanted: Wanted, *, quick: bool = False) -> Form:
         """Return a form for eta that holds at all Jacobians, and at fresh points unless `quick`.
@@ -192,7 +195,7 @@ class Search:
             failing = np.flatnonzero(margins < self._rounding(form))
             new = np.setdiff1d(failing, self.active)
             if len(new):
-                self.active = np.union1d(self.active, new[np.argsort(margins[new])[:6]])
+                self.active = np.union1d(self.active, self._worst(new, margins))
             elif len(failing):
                 if self._checked(wanted) or len(slacks) == 1:
                     raise CertificateError(self._fails(form, eta))
@@ -200,14 +203,12 @@ class Search:
             elif quick:
                 return form
             else:
-                margin, v, second = self.fresh(form, eta, FRESH, self.seed + 100 + round_)
-                if margin >= self._rounding(form):
+                values, pairs = self.fresh(form, eta, FRESH, self.seed + 100 + round_)
+                if values[0] >= self._rounding(form):
                     return form
                 if self.cover.rigorous or self._checked(wanted):
                     raise CertificateError(self._fails(form, eta))
-                pair = self.increments.at(v) if second is None else self.increments.between(v, second)
-                self.points = Jacobians(*(np.concatenate(both) for both in zip(self.points, pair, strict=True)))
-                self.active = np.append(self.active, len(self.points.A) - 1)
+                self._add(self.increments.at(pairs[values < 0].reshape(-1, pairs.shape[2])))
         raise CertificateError(self._fails(form, eta))
 
     def fastest(self, wanted: Wanted) -> tuple[float, Form]:
@@ -257,10 +258,11 @@ class Search:
         eta = float(np.exp(-np.exp(best.x)))
         return eta, self.form(eta, wanted)
 
-    def fresh(self, form: Form, eta: float, count: int, seed: int) -> tuple[float, Array, Array | None]:
-        """Return the smallest margin at fresh points of the domain, and where; the second point for nonlinear outputs.
+    def fresh(self, form: Form, eta: float, count: int, seed: int) -> tuple[Array, Array]:
+        """Return margins at the worst fresh points of the domain (k,), the least first, and these (k, 2, nv).
 
-        Random ones and corners, then a local search from the worst of them.
+        Random ones and corners, then a local search from the worst of them. Pairs, for outputs that are not affine;
+        otherwise the first of each is meant.
         """
         rng, increments, varies = np.random.default_rng(seed), self.increments, self.program.varies
 
@@ -285,8 +287,25 @@ class Search:
             steps[:, :, 1, same] = steps[:, :, 0, same]
             tried = np.clip(keep + steps, increments.lower, increments.upper).reshape(-1, *keep.shape[1:])
             pool, values = np.concatenate([pool, tried]), np.concatenate([values, margins(tried)])
-        worst = int(np.argmin(values))
-        return float(values[worst]), pool[worst, 0], pool[worst, 1] if varies else None
+        chosen, size = [], np.where(width > 0, width, 1.0)
+        for i in np.argsort(values):
+            if all(np.abs((pool[i] - pool[j]) / size).max() > 0.1 for j in chosen):
+                chosen.append(i)
+            if len(chosen) == 8:
+                break
+        return values[chosen], pool[chosen]
+
+    def _worst(self, new: np.ndarray, margins: Array) -> np.ndarray:
+        """Return a few of the points that fail: the worst, and the worst of random parts of the rest."""
+        parts = np.array_split(np.random.default_rng(len(new)).permutation(new), 5)
+        return np.unique(
+            [new[np.argmin(margins[new])], *(part[np.argmin(margins[part])] for part in parts if len(part))]
+        )
+
+    def _add(self, more: Jacobians) -> None:
+        """Add points to those that a form has to hold at."""
+        self.active = np.append(self.active, len(self.points.A) + np.arange(len(more.A)))
+        self.points = _joined(self.points, more)
 
     def _checked(self, wanted: Wanted) -> bool:
         return wanted.objective != "share" and all(part is not None for part in (wanted.P, *wanted.W, wanted.R))
@@ -297,16 +316,21 @@ class Search:
         return self.program.solve(self.points.take(self.active), eta, wanted)
 
     def _rounding(self, form: Form) -> float:
-        scale = self.sizes.scale
-        sizes = np.abs(scale @ np.diag(np.zeros(len(scale))) @ scale).max(initial=0.0)
-        parts = (self.sizes.units.x @ form.P @ self.sizes.units.x, self.sizes.units.y @ form.R @ self.sizes.units.y)
-        return -ROUNDING * max(sizes, *(np.abs(part).max() for part in parts))
+        units = self.sizes.units
+        return -ROUNDING * max(
+            np.abs(unit @ part @ unit).max() for unit, part in ((units.x, form.P), (units.y, form.R))
+        )
 
     def _fails(self, form: Form, eta: float) -> str:
-        margin, v, _ = self.fresh(form, eta, FRESH, self.seed)
+        values, pairs = self.fresh(form, eta, FRESH, self.seed)
+        margin, v = float(values[0]), pairs[0, 0]
         least = min(margin, float(self.sizes.margins(form, eta, self.points).min()))
         where = f"; at fresh points by {-margin:.3g}, at {point(self.increments, v)}" if margin < 0 else ""
         return (
             f"the inequality fails at eta = {eta:.6g} by {-least:.3g} in nominal units on the cover "
             f"({self.cover.method}){where}; try a slower rate, larger Q and R, or a smaller domain"
         )
+
+
+def _joined(some: Jacobians, more: Jacobians) -> Jacobians:
+    return Jacobians(*(np.concatenate(both) for both in zip(some, more, strict=True)))

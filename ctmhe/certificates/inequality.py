@@ -32,8 +32,6 @@ from ctmhe.types import Array
 GAIN = 1e6
 """How much more noise of nominal size may weigh than an error of nominal size. Fast rates ask for more and more."""
 
-OBJECTIVES = ("gain", "P", "conditioning", "share")
-
 
 @dataclass(frozen=True, eq=False)
 class Form:
@@ -66,8 +64,8 @@ class Sizes:
         """Return f (k, nx, nx + nd) and h (k, ny, nx + nd)."""
         A, B, E, C, D, F = jacobians
         f, h = {"w": B, "p": E}, {"w": D, "p": F}
-        parts = ([A, *(f[group] for group in self.groups)], [C, *(h[group] for group in self.groups)])
-        return np.concatenate(parts[0], axis=2), np.concatenate(parts[1], axis=2)
+        rows = ([A, *(f[group] for group in self.groups)], [C, *(h[group] for group in self.groups)])
+        return np.concatenate(rows[0], axis=2), np.concatenate(rows[1], axis=2)
 
     def gaps(self, form: Form, eta: float, jacobians: Jacobians) -> Array:
         """Return the gap in nominal units at k points (k, nx + nd, nx + nd); with its bound, if the form has an N."""
@@ -99,9 +97,9 @@ class Wanted:
     Attributes
     ----------
     objective : str
-        `gain`: least W and R for P at least one, all in nominal units; `P`: largest smallest eigenvalue of P in the model's
-        units, W and R given; `conditioning`: least condition number of P in nominal units; `share`: P of the form at most
-        the given one, and the largest share of it.
+        `gain`: least W and R for P at least one, all in nominal units; `P`: largest smallest eigenvalue of P in the
+        model's units, W and R given; `conditioning`: least condition number of P in nominal units; `share`: P of the
+        form at most the given one, and the largest share of it.
     P : array, optional
         Given, or with `share` its bound.
     W : tuple of array or None
@@ -122,13 +120,20 @@ class Wanted:
 
 
 class Program:
-    """The semidefinite program for a model on a domain: coordinates and units once, then many questions."""
+    """The semidefinite program for a model on a domain: units once, then many questions.
+
+    Attributes
+    ----------
+    varies : bool
+        Outputs are not affine.
+    pace : float
+        Its unit of time, per second: entries of A are of size one.
+    """
 
     def __init__(self, sizes: Sizes, increments: Increments, points: Jacobians):
-        self.sizes, self.centre = sizes, increments.at(increments.centre)
-        self.varies = not (constant(points.C) and constant(points.D) and constant(sizes.stacked(points)[1]))
+        self.sizes, self.points, self.centre = sizes, points, increments.at(increments.centre)
+        self.varies = not constant(sizes.stacked(points)[1])
         self.pace = 1.0 if sizes.units.discrete else sizes.units.pace(points)
-        self.points = points
 
     def solve(self, points: Jacobians, eta: float, wanted: Wanted) -> Form:
         """Return a form that meets the inequality at the points, by the solver's word.
@@ -138,95 +143,118 @@ class Program:
         CertificateError
             If the program is infeasible or fails.
         """
-        cp = require_cvxpy()
-        sizes, units = self.sizes, self.sizes.units
-        basis = coordinates(units, self.points, self.centre, eta)
+        cp, sizes, units = require_cvxpy(), self.sizes, self.sizes.units
+        basis = self._basis(eta)
         inside = replace(sizes, units=replace(units, x=basis))
         f, h = inside.stacked(inside.units.scaled(points))
-        f = f / self.pace
-        n, m, ny = len(units.x), f.shape[2], len(units.y)
-        fixed = wanted.P is not None or wanted.objective == "P"
-        factor = 1.0 if fixed else cp.Variable(nonneg=True)
-        groups = [getattr(units, group) for group in sizes.groups]
-        W = [self._weight(given, unit, factor) for given, unit in zip(wanted.W, groups, strict=True)]
-        R = self._weight(wanted.R, units.y, factor)
-        least = np.linalg.inv(units.x) @ basis  # P = 1 in nominal units
-        constraints: list[Any] = [weight >> 0 for weight in (*W, R) if weight is not None and not _given(weight)]
-        P = cp.Variable((n, n), symmetric=True)
-        if wanted.P is not None and wanted.objective != "share":
-            P = cp.Constant(_symmetric(basis.T @ wanted.P @ basis))
-        N = cp.Variable((ny, m)) if self.varies else None
-        edges = np.cumsum([n, *(len(unit) for unit in groups)])
-        in_x, *places = np.split(np.eye(m), edges[:-1], axis=1)
-        supply = sum((place @ part @ place.T for part, place in zip(W, places, strict=True) if part is not None), 0.0)
-        rate = eta if units.discrete else np.log(eta) / self.pace
-        supply = supply + rate * (in_x @ P @ in_x.T)
-        for one, seen in zip(f, h, strict=True):
-            gap = supply + seen.T @ R @ seen if N is None else supply + seen.T @ N + N.T @ seen
-            if not units.discrete:
-                half = in_x @ P @ one
-                gap = gap - half - half.T
-            rows = [[gap]]
-            if units.discrete:
-                rows = [[gap, one.T @ P], [P @ one, P]]
-            if N is not None:
-                corner = [np.zeros((ny, n))] if units.discrete else []
-                rows = [[*row, tall] for row, tall in zip(rows, (N.T, np.zeros((n, ny))), strict=False)]
-                rows.append([N, *corner, R])
-            matrix = cp.bmat(rows)
-            constraints.append((matrix + matrix.T) / 2 >> wanted.slack * np.eye(matrix.shape[0]))
-        gain = sum((cp.trace(part) for part in W if part is not None), cp.trace(R))
-        small = 1e-6 * cp.trace(P)
+        given = [*wanted.W, wanted.R]
+        scales = [*(getattr(units, group) for group in sizes.groups), units.y]
+        free = wanted.P is None and wanted.objective != "P" and any(w is not None and len(w) for w in given)
+        factor = cp.Variable(nonneg=True) if free else 1.0
+        weights = [
+            cp.Variable((len(unit), len(unit)), symmetric=True) if w is None else factor * (unit @ w @ unit / self.pace)
+            for w, unit in zip(given, scales, strict=True)
+        ]
+        constraints: list[Any] = [weight >> 0 for weight, w in zip(weights, given, strict=True) if w is None]
+        P: Any = cp.Variable((len(basis), len(basis)), symmetric=True)
+        bound = None if wanted.P is None else _symmetric(basis.T @ wanted.P @ basis)
+        if bound is not None and wanted.objective != "share":
+            P = cp.Constant(bound)
+        N = cp.Variable(h.shape[1:]) if self.varies else None
+        matrices = self._matrices(f / self.pace, h, eta, P, weights, N)
+        steady = [] if self.varies else self._steady(f)
+        constraints += _all_positive(matrices, steady, wanted.slack)
+        one = _symmetric((np.linalg.inv(units.x) @ basis).T @ np.linalg.inv(units.x) @ basis)  # P = 1 in nominal units
+        gain = sum(cp.trace(weight) for weight in weights if weight.shape[0])
+        size = cp.Variable()
         if wanted.objective == "P":
-            size = cp.Variable()
             goal, more = cp.Maximize(size), [P >> size * _symmetric(basis.T @ basis)]
         elif wanted.objective == "share":
-            size, top = cp.Variable(), _symmetric(basis.T @ wanted.P @ basis)
-            goal, more = cp.Maximize(size), [P << top, P >> size * top, size >= 1 / GAIN]
-        elif wanted.objective == "conditioning" and wanted.P is None:
-            size = cp.Variable()
-            goal = cp.Minimize(size + 1e-9 * gain)
-            more = [P >> least.T @ least, P << size * (least.T @ least)]
+            goal, more = cp.Maximize(size), [P << bound, P >> size * bound, size >= 1 / GAIN]
+        elif wanted.objective == "conditioning":
+            goal, more = cp.Minimize(size + 1e-9 * gain), [P >> one, P << size * one]
         else:
-            goal = cp.Minimize(gain + small)
-            more = [] if wanted.P is not None else [P >> least.T @ least]
-        if wanted.limit is not None and not _given(gain):
-            smallest = 1.0 if wanted.P is None else float(np.linalg.eigvalsh(units.x @ wanted.P @ units.x)[0])
-            more.append(gain <= wanted.limit * smallest / self.pace)
+            goal, more = cp.Minimize(gain + 1e-6 * cp.trace(P)), [P >> one] if bound is None else []
+        if wanted.limit is not None and (free or any(w is None for w in given)):
+            least = 1.0 if wanted.P is None else float(np.linalg.eigvalsh(units.x @ wanted.P @ units.x)[0])
+            more.append(gain <= wanted.limit * least / self.pace)
         solved(cp.Problem(goal, constraints + more))
-        x, y = np.linalg.inv(basis), np.linalg.inv(units.y)
-        inputs = [np.linalg.inv(unit) for unit in groups]
-        form = Form(
-            _symmetric(x.T @ P.value @ x),
-            tuple(
-                np.zeros((0, 0)) if part is None else self.pace * _symmetric(unit @ _number(part) @ unit)
-                for part, unit in zip(W, inputs, strict=True)
-            ),
-            self.pace * _symmetric(y @ _number(R) @ y),
-            None if N is None else self.pace * y @ N.value @ block_diag(x, *inputs),
-        )
-        return (
-            form
-            if fixed or not isinstance(factor, cp.Variable) or factor.value is None
-            else form.scaled(1 / max(float(factor.value), 1e-300))
-        )
+        x, *back = (np.linalg.inv(unit) for unit in (basis, *scales))
+        found = [
+            self.pace * unit @ _lifted(weight.value) @ unit if w is None else (w if not free else w * factor.value)
+            for w, weight, unit in zip(given, weights, back, strict=True)
+        ]
+        N_ = None if N is None else self.pace * back[-1] @ N.value @ block_diag(x, *back[:-1])
+        form = Form(_symmetric(x.T @ P.value @ x), tuple(found[:-1]), found[-1], N_)
+        if not free:
+            return form
+        form = form.scaled(1 / float(factor.value))
+        W = tuple(own if w is None else w for own, w in zip(form.W, wanted.W, strict=True))
+        return replace(form, W=W, R=form.R if wanted.R is None else wanted.R)
 
-    def _weight(self, given: Array | None, unit: Array, factor: Any) -> Any:
-        """Return a weight in the program's units: a variable, a given one up to the factor, None for no signals."""
-        cp, n = require_cvxpy(), len(unit)
-        if not n:
-            return None
-        if given is None:
-            return cp.Variable((n, n), symmetric=True)
-        return factor * (unit @ given @ unit / self.pace)
+    def _basis(self, eta: float) -> Array:
+        """Return coordinates of x in which those through which nothing varies stay apart from the others: the last."""
+        basis = coordinates(self.sizes.units, self.points, self.centre, eta)
+        order = np.argsort([constant(self.points.A[:, :, j]) for j in range(len(basis))], kind="stable")
+        basis[order] = np.linalg.cholesky((basis @ basis.T)[np.ix_(order, order)])
+        return basis
+
+    def _matrices(self, f: Array, h: Array, eta: float, P: Any, weights: list[Any], N: Any) -> list[Any]:
+        """Return what has to be positive, one matrix a point: the gap, with Schur complements for f'P f and N."""
+        cp, n, m, ny = require_cvxpy(), f.shape[1], f.shape[2], h.shape[1]
+        discrete, (*W, R) = self.sizes.units.discrete, weights
+        edges = np.cumsum([n, *(part.shape[0] for part in W)])
+        in_x, *places = np.split(np.eye(m), edges[:-1], axis=1)
+        fixed = (eta if discrete else np.log(eta) / self.pace) * (in_x @ P @ in_x.T)
+        for part, place in zip(W, places, strict=True):
+            fixed = fixed + place @ part @ place.T if part.shape[0] else fixed
+        found = []
+        for one, seen in zip(f, h, strict=True):
+            gap = fixed + (seen.T @ R @ seen if N is None else seen.T @ N + N.T @ seen)
+            rows = [[gap]]
+            if discrete:
+                rows = [[gap, one.T @ P], [P @ one, P]]
+            else:
+                half = in_x @ P @ one
+                rows = [[gap - half - half.T]]
+            if N is not None:
+                rows = [[*row, tall] for row, tall in zip(rows, (N.T, np.zeros((n, ny))), strict=False)]
+                rows.append([N, *([np.zeros((ny, n))] if discrete else []), R])
+            matrix = cp.bmat(rows)
+            found.append((matrix + matrix.T) / 2)
+        return found
+
+    def _steady(self, f: Array) -> list[int]:
+        """Return the columns of (x, d) through which nothing varies, outputs being affine.
+
+        In continuous time P f couples a state to the others' columns, so that disturbances alone stay apart.
+        """
+        first = 0 if self.sizes.units.discrete else f.shape[1]
+        return [j for j in range(first, f.shape[2]) if len(f) > 1 and constant(f[:, :, j])]
 
 
-def _given(weight: Any) -> bool:
-    return not hasattr(weight, "is_symmetric") or bool(weight.is_constant())
+def _all_positive(matrices: list[Any], steady: list[int], slack: float) -> list[Any]:
+    """Return constraints by which all matrices are at least the slack, the rows of `steady` being the same in all.
+
+    [[M_k, G], [G', W]] >= 0 for all k if and only if some Z has M_k >= Z and [[Z, G], [G', W]] >= 0. What there is a
+    matrix of for each point becomes smaller by the noise.
+    """
+    cp, size = require_cvxpy(), matrices[0].shape[0]
+    if not steady:
+        return [matrix >> slack * np.eye(size) for matrix in matrices]
+    rest = [j for j in range(size) if j not in steady]
+    order, n = np.eye(size)[:, [*rest, *steady]], len(rest)
+    Z, pick, lift = cp.Variable((n, n), symmetric=True), np.eye(size)[:, rest], np.eye(size, n)
+    parts = [pick.T @ matrix @ pick for matrix in matrices]
+    common = order.T @ matrices[0] @ order + lift @ (Z - parts[0]) @ lift.T
+    return [(common + common.T) / 2 >> slack * np.eye(size), *(part - Z >> slack * np.eye(n) for part in parts)]
 
 
-def _number(weight: Any) -> Array:
-    return np.asarray(getattr(weight, "value", weight), dtype=float)
+def _lifted(weight: Array) -> Array:
+    """Return a weight, by the solver's inaccuracy larger where it is not positive definite."""
+    value = _symmetric(weight)
+    least = float(np.linalg.eigvalsh(value)[0])
+    return value + max(0.0, 1e-12 * float(np.abs(value).max()) - least) * np.eye(len(value))
 
 
 def _symmetric(matrix: Array) -> Array:

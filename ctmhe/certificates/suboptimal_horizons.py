@@ -72,14 +72,13 @@ def cost_factor(
             f"Assumption 4.4: eta_s = {system.eta:g} must not exceed eta_o = {observer.eta:g}, nor P_s that of the "
             f"observer; U times {scale:.4g} (for_weights) meets the latter"
         )
-    least = [float(np.linalg.eigvalsh(part)[0]) for part in (observer.P_lower, observer.Q, observer.R) if len(part)]
+    P_o, Q_o, R_o = (_inverse(part) for part in (observer.P_lower, observer.Q, observer.R))
     output = 2 * _largest(system.R) * L_h**2
     if L_f is not None:
         if L_f < 1:
             raise InputError(f"L_f: Assumption 4.5 has it at least 1, got {L_f!r}; take 1")
-        c_1 = max(1.0, *(1 / value for value in least))
-        return N * output * c_1 * eta**-N * _geometric(fade, L_f**2, N)
-    c_2 = output * max(1.0, *(1 / value for value in (least[0], *least[2:])))
+        return N * output * max(1.0, P_o, Q_o, R_o) * eta**-N * _geometric(fade, L_f**2, N)
+    c_2 = output * max(1.0, P_o, R_o)
     Q_s = system.Q if Q_s is None else np.atleast_2d(np.asarray(Q_s, dtype=float))
     gain = _largest(Q_s) * float(kappa or 0.0) ** 2 / float(np.linalg.eigvalsh(system.R)[0])
     front = 3 / 4 * (1 + 4 * gain) if projected else 1 + 2 * gain
@@ -152,6 +151,11 @@ def trajectory_horizon(observer: ObserverFunction, W: Any, *, filtering: bool = 
 
 def _largest(matrix: Array) -> float:
     return float(np.linalg.eigvalsh(matrix)[-1]) if len(matrix) else 0.0
+
+
+def _inverse(matrix: Array) -> float:
+    """Return 1 / lambda_min."""
+    return 1 / float(np.linalg.eigvalsh(matrix)[0]) if len(matrix) else 0.0
 
 
 def _geometric(a: float, b: float, n: int) -> float:

@@ -160,6 +160,8 @@ def test_what_the_theorems_ask_for_is_demanded():
         observer_horizon(observer.scaled(0.1), system, **common, kappa=1.0)
     with pytest.raises(InputError, match="symmetric and positive definite"):
         ObserverFunction(np.eye(2), np.diag([1.0, -1.0]), np.eye(2), np.eye(1), 0.9)
+    with pytest.raises(InputError, match="P_lower must not exceed P_upper"):
+        ObserverFunction(np.eye(2), np.eye(2) / 2, np.eye(2), np.eye(1), 0.9)
     with pytest.raises(InputError, match="eta must lie"):
         ObserverFunction(np.eye(2), np.eye(2), np.eye(2), np.eye(1), 1.0)
 
