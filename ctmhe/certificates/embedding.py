@@ -46,7 +46,7 @@ MOST_POINTS = 6000
 MOST_SIDES = 12
 """Of a box of entries: 4096 vertices."""
 
-MOST_SECTIONS = 8
+MOST_SECTIONS, CUT = 8, 512
 STRETCH = 0.05
 """What the remainder may stretch the hull by."""
 
@@ -281,9 +281,9 @@ def _followed(given: Reduced, tape: Intervals, at: Callable[[Array], Array], i: 
     free = moving[_free(samples[:, moving] / scale[moving])]
     if len(free) > MOST_SECTIONS:
         return None
-    edges, bounds = np.linspace(lower, upper, 65), np.zeros((DEGREE + 1, len(free)))
+    edges, bounds = np.linspace(lower, upper, CUT + 1), np.zeros((DEGREE + 1, len(free)))
     for k, (rest, entry) in enumerate(zip(*np.divmod(free, tape.size), strict=True)):
-        low, high = np.tile(rests[rest], (64, 1)), np.tile(rests[rest], (64, 1))
+        low, high = (np.tile(rests[rest], (CUT, 1)) for _ in range(2))
         low[:, i], high[:, i] = edges[:-1], edges[1:]
         bounds[:, k] = derivative_bounds(tape, low, high, i, DEGREE)[:, entry] / scale[free[k]]
     sizes = sorted(product(range(1, DEGREE), (1, 2, 4, 8, 16, 32)), key=lambda c: ((c[0] + 1) * c[1], c[0]))
