@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
-from dataclasses import dataclass
-from math import comb
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
+from ctmhe.certificates.embedding import (
+    DEGREE,
+    PIECES,
+    bernstein,
+    combined,
+    degrees_of,
+    hull_points,
+    is_rough,
+    outermost,
+)
 from ctmhe.errors import InputError
 from ctmhe.models.continuous import KINDS, Model, box_arrays
 from ctmhe.types import Array, Bounds
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 NODES, WEIGHTS = (NODES + 1) / 2, WEIGHTS / 2  # exact for Jacobians of degree 15 and less
-DEGREE, PIECES, MOST_POINTS, GRID_POINTS, KEPT = 8, 4, 20_000, 400, 40
-ROUGH = (
-    *(ca.OP_FABS, ca.OP_SIGN, ca.OP_FLOOR, ca.OP_CEIL, ca.OP_FMIN, ca.OP_FMAX, ca.OP_FMOD, ca.OP_COPYSIGN),
-    *(ca.OP_IF_ELSE_ZERO, ca.OP_LT, ca.OP_LE, ca.OP_EQ, ca.OP_NE, ca.OP_AND, ca.OP_OR, ca.OP_NOT),
-)
-"""Instructions that are not analytic: that a derivative vanishes at random points proves nothing of them."""
+MOST_POINTS, GRID_POINTS, KEPT = 20_000, 400, 40
 
 
 class Jacobians(NamedTuple):
@@ -51,7 +53,8 @@ class Cover:
     ----------
     jacobians : Jacobians
     method : str
-        `constant`; `vertices` of a multi-affine Jacobian; `bernstein` coefficients of a polynomial one; `grid`.
+        `constant`; `vertices` of a multi-affine Jacobian; `bernstein` coefficients of a polynomial one; `interval`
+        bounds of any; `grid`.
     rigorous : bool
         The hull holds them all, to rounding; a grid is evidence only.
     """
@@ -109,15 +112,17 @@ class Increments:
             )
         blocks = [ca.jacobian(value, v)[:, self.place[key]] for value in values for key in "xwp"]
         self._shapes = [block.shape for block in blocks]
+        ends = np.cumsum([0, *(block.numel() for block in blocks)])
+        self._columns = [slice(start, end) for start, end in zip(ends[:-1], ends[1:], strict=True)]
         stacked = ca.densify(ca.vertcat(*(ca.vec(block) for block in blocks)))
         self._at = ca.Function("jacobians", [v], [stacked])
         self.degrees: np.ndarray | None = None
         self.varying = np.arange(len(self.names))
         if self.symbolic:
-            degrees = _degrees(stacked, v, self.nominal)
+            degrees = degrees_of(stacked, v, self.nominal)
             self.varying = np.flatnonzero(degrees)
-            rough = any(self._at.instruction_id(k) in ROUGH for k in range(self._at.n_instructions()))
-            self.degrees = degrees if (degrees <= DEGREE).all() and not rough else None
+            self._expression, self._rough = (blocks, v), is_rough(self._at)
+            self.degrees = degrees if (degrees <= DEGREE).all() and not self._rough else None
         self._demand_bounds()
 
     def _demand_bounds(self) -> None:
@@ -133,14 +138,15 @@ class Increments:
 
     def at(self, v: Array) -> Jacobians:
         """Return the Jacobians at points v (k, nv)."""
-        v = np.atleast_2d(np.asarray(v, dtype=float))
-        flat = np.asarray(ca.DM(self._at(ca.DM(v.T)))).T
-        parts, start = [], 0
-        for rows, columns in self._shapes:
-            block = flat[:, start : start + rows * columns].reshape(len(v), columns, rows)
-            parts.append(block.transpose(0, 2, 1))
-            start += rows * columns
-        return Jacobians(*parts)
+        return self._parts(self._flat(np.atleast_2d(np.asarray(v, dtype=float))))
+
+    def _flat(self, v: Array) -> Array:
+        return np.asarray(ca.DM(self._at(ca.DM(v.T)))).T
+
+    def _parts(self, flat: Array) -> Jacobians:
+        shapes = zip(self._shapes, self._columns, strict=True)
+        parts = (flat[:, place].reshape(len(flat), columns, rows) for (rows, columns), place in shapes)
+        return Jacobians(*(part.transpose(0, 2, 1) for part in parts))
 
     def between(self, v1: Array, v2: Array) -> Jacobians:
         """Return mean values between points v1 and v2 (k, nv) with equal inputs: f(v1) - f(v2) = A dx + B dw + E dp.
@@ -193,63 +199,54 @@ class Increments:
         """Return Jacobians whose hull holds those of the domain, in the named parts together; see `Cover`.
 
         A polynomial lies in the hull of its Bernstein coefficients; of one that is affine in every signal these are the
-        values at the vertices. Signals of higher degree are cut into pieces first, which tightens the hull.
+        values at the vertices. Signals of higher degree are cut into pieces first, which tightens the hull. What is no
+        polynomial, or one in too many signals, is bounded as `embedding` explains. Parts that are not named are those
+        at some points of the domain.
         """
-        if self.degrees is None:
-            return self._grid(which)
         if not len(self.varying):
             return Cover(self.at(self.centre), "constant", True)
-        degrees = self.degrees[self.varying]
+        found = self._polynomial(which) or self._embedded(which) or self._grid(which)
+        return replace(found, method="constant") if len(found.jacobians.A) == 1 and found.rigorous else found
+
+    def _polynomial(self, which: str) -> Cover | None:
+        if self.degrees is None:
+            return None
+        degrees, lower, upper = (part[self.varying] for part in (self.degrees, self.lower, self.upper))
         if np.where(degrees > 1, PIECES * (degrees + 1), 2).prod() > MOST_POINTS:
-            return self._grid(which)
-        found = _pruned(self._coefficients(degrees), which)
-        method = "constant" if len(found.A) == 1 else "bernstein" if (degrees > 1).any() else "vertices"
-        return Cover(found, method, True)
+            return None
+
+        def at(points: Array) -> Array:
+            v = np.tile(self.centre, (len(points), 1))
+            v[:, self.varying] = points
+            return self._flat(v)
+
+        sides = zip(lower, upper, degrees, strict=True)
+        coefficients = combined(at, [bernstein(a, b, int(d), PIECES if d > 1 else 1) for a, b, d in sides])
+        method = "bernstein" if (degrees > 1).any() else "vertices"
+        return Cover(_pruned(self._parts(coefficients), which), method, True)
+
+    def _embedded(self, which: str) -> Cover | None:
+        if not self.symbolic:
+            return None
+        blocks, v = self._expression
+        of_interest = ca.vertcat(*(ca.vec(blocks["ABECDF".index(letter)]) for letter in which))
+        lower, upper = self.lower.copy(), self.upper.copy()
+        fixed = np.setdiff1d(np.arange(len(self.names)), self.varying)
+        lower[fixed], upper[fixed] = self.centre[fixed], self.centre[fixed]
+        found = hull_points(of_interest, v, lower, upper, smooth=not self._rough)
+        if found is None:
+            return None
+        flat, start = np.repeat(self._flat(self.centre[None]), len(found), axis=0), 0
+        for letter in which:
+            place = self._columns["ABECDF".index(letter)]
+            flat[:, place] = found[:, start : start + place.stop - place.start]
+            start += place.stop - place.start
+        return Cover(_pruned(self._parts(flat), which), "interval", True)
 
     def _grid(self, which: str) -> Cover:
         samples = self.random(GRID_POINTS, np.random.default_rng(0))
         found = _pruned(self.at(np.vstack([samples, self.corners()])), which)
         return Cover(_farthest(found, which), "grid", False)
-
-    def _coefficients(self, degrees: np.ndarray) -> Jacobians:
-        """Return the Bernstein coefficients of all pieces of the box."""
-        axes, inverses = [], []
-        for i, d in zip(self.varying, degrees, strict=True):
-            edges = np.linspace(self.lower[i], self.upper[i], (PIECES if d > 1 else 1) + 1)
-            nodes = np.linspace(0.0, 1.0, d + 1)
-            axes.append((edges[:-1, None] + nodes * np.diff(edges)[:, None]).ravel())
-            inverse = np.linalg.inv([[comb(d, k) * s**k * (1 - s) ** (d - k) for k in range(d + 1)] for s in nodes])
-            inverses.append(np.kron(np.eye(len(edges) - 1), inverse))
-        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
-        v = np.tile(self.centre, (len(grid), 1))
-        v[:, self.varying] = grid
-        shape = tuple(len(axis) for axis in axes)
-
-        def converted(part: Array) -> Array:
-            values = part.reshape(*shape, part[0].size)
-            for axis, inverse in enumerate(inverses):
-                values = np.moveaxis(np.tensordot(inverse, values, (1, axis)), 0, axis)
-            return values.reshape(part.shape)
-
-        return Jacobians(*(converted(part) for part in self.at(v)))
-
-
-def _degrees(stacked: Any, v: Any, nominal: Array) -> np.ndarray:
-    """Return the degree of expressions in every entry of v; DEGREE + 1 for more, or where they are no polynomials."""
-    rng, found = np.random.default_rng(0), np.zeros(len(nominal), dtype=int)
-    points = ca.DM(nominal[:, None] * rng.normal(size=(len(nominal), 12)))
-    for i in range(len(nominal)):
-        derivative, scale = stacked, 0.0
-        while found[i] <= DEGREE:
-            derivative = ca.jacobian(derivative, v[i])
-            if derivative.nnz() == 0:
-                break
-            size = np.abs(np.asarray(ca.DM(ca.Function("d", [v], [ca.densify(derivative)])(points))))
-            scale = max(scale, np.nanmax(size, initial=0.0))
-            if np.isfinite(size).all() and size.max(initial=0.0) <= 1e-12 * scale:
-                break  # analytic functions that vanish at random points vanish everywhere
-            found[i] += 1
-    return found
 
 
 def _pruned(jacobians: Jacobians, which: str) -> Jacobians:
@@ -262,13 +259,7 @@ def _pruned(jacobians: Jacobians, which: str) -> Jacobians:
     left, sizes, _ = np.linalg.svd(flat, full_matrices=False)
     rank = int((sizes > 1e-11).sum())
     inner, keep = left[:, :rank] * sizes[:rank], np.arange(len(first))
-    if rank == 0:
-        keep = keep[:1]
-    elif rank == 1:
-        keep = np.array([inner.argmin(), inner.argmax()])
-    elif rank <= 4 and len(first) > rank + 1:
-        with suppress(QhullError):
-            keep = np.sort(ConvexHull(inner).vertices)
+    keep = outermost(inner) if rank else keep[:1]
     return jacobians.take(first[keep])
 
 

@@ -77,11 +77,11 @@ class Intervals:
                 elif code == ca.OP_OUTPUT:
                     results[:, :, target] = kept[left]
                 elif code in UNARY:
-                    kept[target] = _outward(UNARY[code](*kept[left]))
+                    kept[target] = outward(UNARY[code](*kept[left]))
                 elif left == right and code in ALIKE:
-                    kept[target] = _outward(ALIKE[code](*kept[left]))
+                    kept[target] = outward(ALIKE[code](*kept[left]))
                 else:
-                    kept[target] = _outward(BINARY[code](*kept[left], *kept[right]))
+                    kept[target] = outward(BINARY[code](*kept[left], *kept[right]))
         return results[0], results[1]
 
 
@@ -114,7 +114,7 @@ class Enclosure:
         way = size.sum(axis=2) * (1 + self.entries * ULPS)
         at = self.plain(middle, middle)
         with np.errstate(invalid="ignore"):
-            nearer = _outward((at[0] - way, at[1] + way))
+            nearer = outward((at[0] - way, at[1] + way))
         return np.fmax(low, nearer[0]), np.fmin(high, nearer[1]), size
 
     def over(self, lower: Array, upper: Array, *, boxes: int = 1024) -> Pair:
@@ -124,7 +124,7 @@ class Enclosure:
         while 2 * len(lower) <= boxes:
             with np.errstate(invalid="ignore"):
                 width = np.fmax(high.max(axis=0) - low.min(axis=0), 1e-300)
-                share = np.nan_to_num(size / width, nan=1.0, posinf=1e9).max(axis=1)
+                share = np.nan_to_num(size / width[:, None], nan=1.0, posinf=1e9).max(axis=1)
             share = np.where(upper > lower, share, 0.0)
             if share.max(initial=0.0) <= 1e-12:
                 break
@@ -139,7 +139,7 @@ class Enclosure:
         return low.min(axis=0), high.max(axis=0)
 
 
-def _outward(pair: Pair) -> Pair:
+def outward(pair: Pair) -> Pair:
     """Widen relatively: zero stays zero, so that roots of squares stay defined."""
     low, high = pair
     low = np.where(np.isnan(low), -np.inf, low - ULPS * np.abs(low))
@@ -223,7 +223,7 @@ def _power(a: Array, b: Array, c: Array, d: Array) -> Pair:
     below = np.where((n % 2 == 0) & (a <= 0) & (b >= 0), 0.0, ends.min(axis=0))
     below, above = np.where(n == 0, 1.0, below), ends.max(axis=0)
     if whole.any() and (c < 0).any():
-        widened = _outward((below, above))
+        widened = outward((below, above))
         under = _inverse(*widened)
         below, above = np.where(c < 0, under[0], below), np.where(c < 0, under[1], above)
     low, high = np.where(whole, below, low), np.where(whole, above, high)
@@ -301,7 +301,7 @@ BINARY: dict[int, Callable[[Array, Array, Array, Array], Pair]] = {
     ca.OP_ADD: lambda a, b, c, d: (a + c, b + d),
     ca.OP_SUB: lambda a, b, c, d: (a - d, b - c),
     ca.OP_MUL: _times,
-    ca.OP_DIV: lambda a, b, c, d: _times(a, b, *_outward(_inverse(c, d))),
+    ca.OP_DIV: lambda a, b, c, d: _times(a, b, *outward(_inverse(c, d))),
     ca.OP_POW: _power,
     ca.OP_CONSTPOW: _power,
     ca.OP_FMIN: lambda a, b, c, d: (np.minimum(a, c), np.minimum(b, d)),
