@@ -1,22 +1,44 @@
 """What is guaranteed, computed from a model and a domain: numbers for estimators and triggers.
 
-Names are loaded when asked for: they need parts of SciPy that estimators do without.
+Names are loaded when asked for: most need parts of SciPy that estimators do without.
 """
 
 from importlib import import_module
 from typing import Any
 
-PLACES = {
-    "DetectabilityCertificate": "certificate",
-    "Guarantee": "guarantee",
-    "certify_detectability": "detectability",
-    "predict_growth": "growth",
+_PLACES = {
+    "certificate": ("DetectabilityCertificate",),
+    "comparison": ("compare_horizons",),
+    "detectability": ("certify_detectability",),
+    "excitation": ("Direction", "ExcitationMonitor", "Information"),
+    "excitation_design": ("design_excitation",),
+    "excited_set": ("ExcitationDesign", "ExcitedSet"),
+    "growth": ("Growth", "predict_growth"),
+    "guarantee": ("Guarantee",),
+    "joint": (
+        "JointBound",
+        "JointCertificate",
+        "OnlineConditions",
+        "certify_jointly",
+        "joint_bound",
+        "search_jointly",
+        "uniform_excitation",
+    ),
+    "joint_horizons": ("joint_conditions", "joint_horizon"),
+    "joint_weights": ("JointWeights", "StateDetectability", "detect_states", "joint_weights", "unmet"),
+    "observers": ("design_observer",),
+    "suboptimal_horizons": ("observer_horizon", "trajectory_horizon"),
 }
+_MODULES = {name: module for module, names in _PLACES.items() for name in names}
 
-__all__ = list(PLACES)
+__all__ = sorted(_MODULES)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in PLACES:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{PLACES[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]

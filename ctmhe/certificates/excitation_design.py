@@ -120,7 +120,7 @@ def design_excitation(
         try:
             if chosen is None:
                 slowest, fastest = 1.1 * np.log(4) / T, min(pace, 4.0 if units.discrete else FASTEST)
-                chosen = _best_factor(lambda factor: attempt(factor, SLACKS[0], speed)[0], slowest, fastest)  # noqa: B023
+                chosen = best_factor(lambda factor: attempt(factor, SLACKS[0], speed)[0], slowest, fastest)  # noqa: B023
             P, Q, R, L = attempt(chosen, least, speed)[1]
         except CertificateError as error:
             failure = error
@@ -156,7 +156,7 @@ def _cover(increments: Increments) -> tuple[Cover, tuple[str, ...]]:
     return Cover(both, "grid", False), (note,)
 
 
-def _best_factor(score_of: Any, slowest: float, fastest: float) -> float:
+def best_factor(score_of: Any, slowest: float, fastest: float) -> float:
     """Return mu of the least score for rates between two: a coarse search, then a fine one.
 
     Raises

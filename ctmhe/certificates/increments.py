@@ -153,14 +153,16 @@ class Increments:
 
         The path first changes p at the first point, then x and w at p of the second. (7.39) goes straight, which serves
         the proofs equally well, but then E depends on the second point even if f is affine in p, and (7.68) is needed.
+        A and E lie in the hulls of theirs, but not together in the hull of both: conditions on both ask for `mean`.
         """
         v1, v2 = np.broadcast_arrays(np.atleast_2d(v1), np.atleast_2d(v2))
         corner = v1.copy()
         corner[:, self.place["p"]] = v2[:, self.place["p"]]
-        first, second = self._mean(v1, corner), self._mean(corner, v2)
+        first, second = self.mean(v1, corner), self.mean(corner, v2)
         return Jacobians(second.A, second.B, first.E, second.C, second.D, first.F)
 
-    def _mean(self, start: Array, end: Array) -> Jacobians:
+    def mean(self, start: Array, end: Array) -> Jacobians:
+        """Return mean values (7.39) on the lines from start to end (k, nv), in the hull of the point values."""
         found = self.at(np.vstack([start + s * (end - start) for s in NODES]))
         shape = (len(NODES), len(start))
         return Jacobians(*(np.tensordot(WEIGHTS, part.reshape(*shape, *part.shape[1:]), 1) for part in found))

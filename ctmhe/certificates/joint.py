@@ -10,12 +10,13 @@ from scipy.linalg import block_diag, eigh
 from scipy.optimize import minimize_scalar
 
 from ctmhe.certificates.excitation import ExcitationMonitor
-from ctmhe.certificates.excitation_design import filter_bounds
+from ctmhe.certificates.excitation_design import best_factor, design_excitation, filter_bounds
 from ctmhe.certificates.excited_set import ExcitationDesign, ExcitedSet
 from ctmhe.certificates.injection import Units, least_upper_bound
 from ctmhe.certificates.joint_weights import StateDetectability
 from ctmhe.errors import CertificateError, InputError
-from ctmhe.types import Array, DiscountedCost, Trajectory, frozen, positive
+from ctmhe.models.continuous import Model
+from ctmhe.types import Array, Bounds, DiscountedCost, Trajectory, frozen, positive
 
 
 def lyapunov_matrix(P: Array, Y: Array, S: Array) -> Array:
@@ -181,6 +182,53 @@ def certify_jointly(design: ExcitationDesign, *, alpha: float, S_0: Any = None) 
         horizon = float(np.floor(horizon) + 1)
     parts = (frozen(S_0), frozen(M_0), design.mu, design.Q, design.R, alpha, frozen(M_lower), kappa, float(horizon))
     return JointCertificate(design, *parts)
+
+
+def search_jointly(
+    model: Model, expected: Trajectory, domain: Bounds | None = None, *, u: Any = None
+) -> JointCertificate:
+    """Return the joint certificate with the least error of parameters in the long run; lambda is searched too.
+
+    For windows like the expected one and w of nominal size, by (9) of paper 000: 4 times the sum of lambda^(j-1) |w|^2_Q,
+    over 1 - rho, over the window's level. Slow fading averages more noise, fast fading contracts more: rho < 1 by the
+    window's own kappa (33). alpha is half the level of the expected window.
+
+    Parameters
+    ----------
+    model : Model
+        With constant parameters, for which a global design exists.
+    expected : Trajectory
+        Of the length of a window.
+    domain, u
+        As for `design_excitation`.
+
+    Raises
+    ------
+    CertificateError
+        If there is no design at any rate, none is global, or the window says nothing of some parameters.
+    """
+    length = float(expected.t[-1] - expected.t[0]) / (model.step or 1.0)
+    found: dict[float, JointCertificate] = {}
+    w = Units.of(model).w
+
+    def error(mu: float) -> float:
+        design = design_excitation(model, domain, u=u, mu=mu)
+        information = ExcitationMonitor(design).along(expected)
+        if information.level <= 1e-12 * information.directions[-1].level:
+            raise CertificateError(f"search_jointly: the expected window says nothing of {information.directions[0]}")
+        joint = certify_jointly(design, alpha=information.level / 2)
+        rho = joint.check(expected).rho
+        if rho >= 1:
+            raise CertificateError(
+                f"search_jointly: over the expected window U falls by {rho:.3g} at best; it is too short, or says too "
+                f"little of {information.directions[0]}"
+            )
+        found[mu] = joint
+        memory = 1 / (1 - mu) if design.discrete else -1 / np.log(mu)
+        return float(np.trace(w @ joint.Q @ w)) * memory / (information.level * (1 - rho))
+
+    best = best_factor(error, 1.1 * np.log(4) / length, 30 / length)
+    return found[min(found, key=lambda mu: abs(mu - best))]
 
 
 @dataclass(frozen=True, eq=False)

@@ -78,7 +78,7 @@ def detect_states(model: Model, domain: Bounds | None = None, *, eta: float, u: 
     cover, centre = increments.cover(), increments.at(increments.centre)
     parts, method, rigorous = cover.jacobians, cover.method, cover.rigorous
     if not all(constant(part) for part in parts[3:]):
-        pairs = increments.between(*increments.random_pairs(100, np.random.default_rng(3)))
+        pairs = increments.mean(*increments.random_pairs(100, np.random.default_rng(3)))
         parts = Jacobians(*(np.concatenate(both) for both in zip(parts, pairs, strict=True)))
         method, rigorous = "grid", False
     pace = 1.0 if units.discrete else units.pace(parts)  # the program's unit of time
@@ -113,7 +113,7 @@ def detect_states(model: Model, domain: Bounds | None = None, *, eta: float, u: 
     )
     values = (x.T @ P.value @ x, pace * S, pace * Q, pace * y @ R.value @ y)
     P_, S_, Q_, R_ = (frozen((value + value.T) / 2) for value in values)
-    fresh = increments.between(*increments.random_pairs(400, np.random.default_rng(5)))
+    fresh = increments.mean(*increments.random_pairs(400, np.random.default_rng(5)))
     margin = min(detectability_margin(units, eta, (P_, S_, Q_, R_), part).min() for part in (fresh, parts))
     if margin < -1e-9:
         raise CertificateError(

@@ -29,7 +29,8 @@ def solved(problem: Any) -> float:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of inaccurate solutions: every matrix is verified again
-            value = problem.solve(solver=cp.CLARABEL)
+            # cut up along their sparsity, matrices of the small programs here lose their interior
+            value = problem.solve(solver=cp.CLARABEL, chordal_decomposition_enable=False)
     except cp.SolverError:
         raise CertificateError(
             "the semidefinite program could not be solved: it is infeasible or badly scaled. Try a slower rate, a "
