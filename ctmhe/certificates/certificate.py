@@ -141,6 +141,7 @@ class DetectabilityCertificate:
 
 
 def as_matrix(value: Any, n: int, what: str) -> Array:
+    """Return a scalar, a diagonal or a matrix as a matrix (n, n)."""
     array = np.asarray(value, dtype=float)
     if array.ndim == 0:
         return array * np.eye(n)
@@ -152,7 +153,7 @@ def as_matrix(value: Any, n: int, what: str) -> Array:
 
 
 def definite(value: Any, what: str, *, zero: bool = False) -> Array:
-    """Return a symmetric positive definite matrix, `zero`: or a semidefinite one."""
+    """Return a symmetric positive definite matrix; `zero`: or a semidefinite one."""
     array = np.asarray(value, dtype=float)
     if array.ndim != 2 or array.shape[0] != array.shape[1] or not np.isfinite(array).all():
         raise InputError(f"{what} must be a square matrix of finite numbers, got {value!r}")

@@ -21,6 +21,8 @@ from ctmhe.types import Array, Bounds
 OBJECTIVES = ("gain", "rate", "P", "conditioning", "horizon")
 SLACKS = (1e-7, 1e-6, 1e-5, 1e-4)
 FRESH, FIRST, ROUNDS = 2000, 8, 25
+MANY, HASTE = 64, 1.25
+"""From how many Jacobians on the program is asked for how much more of -ln eta: few of them then suffice."""
 ROUNDING = 1e-12
 """Of the largest entry: an eigenvalue that is not below its negative is taken for zero."""
 
@@ -59,8 +61,8 @@ def certify_detectability(
         `gain`: least Q and R for P at least one, in nominal units; the default if eta is given. `rate`: smallest eta,
         the default if not; noise of nominal size then weighs at most `GAIN` as much as an error of nominal size, since
         otherwise observable models have any. `P`: largest smallest eigenvalue of P, for given Q and R.
-        `conditioning`: least condition number of P, in nominal units. `horizon`: shortest horizon (3.30); for a given P it
-        bounds U from above, and the function below it is found; without P the same as `rate`.
+        `conditioning`: least condition number of P, in nominal units. `horizon`: shortest horizon
+        (3.30); a given P bounds U from above, and the function below it is found; without P the same as `rate`.
     jacobians : Cover, optional
         Jacobians of one's own whose hull holds those of the domain: the certificate is as rigorous as they are.
     seed : int
@@ -184,10 +186,15 @@ class Search:
         CertificateError
         """
         slacks = list(SLACKS)
+        haste = HASTE if len(self.points.A) > MANY and not self._checked(wanted) else 1.0
+        form: Form | None = None
         for round_ in range(ROUNDS):
             try:
-                form = self._solved(eta, replace(wanted, slack=slacks[0]))
+                form = self._solved(eta**haste, replace(wanted, slack=slacks[0]))
             except CertificateError as error:
+                if haste > 1:
+                    haste = 1.0
+                    continue
                 why = None if quick else unseen_mode(self.increments, eta)
                 said = f": {why}. No weights help; try a slower rate" if why else f": {error}"
                 raise CertificateError(f"no quadratic function at eta = {eta:.6g}{said}") from None
@@ -209,11 +216,13 @@ class Search:
                 if self.cover.rigorous or self._checked(wanted):
                     raise CertificateError(self._fails(form, eta))
                 self._add(self.increments.at(pairs[values < 0].reshape(-1, pairs.shape[2])))
+        assert form is not None
         raise CertificateError(self._fails(form, eta))
 
     def fastest(self, wanted: Wanted) -> tuple[float, Form]:
         """Return the smallest eta for which a form is found, to one per mille of -ln eta, and the form."""
-        pace, best, bracket = self.program.pace if self.program.pace else 1.0, None, [0.0, np.inf]
+        best: tuple[float, Form] | None = None
+        pace, bracket, last = self.program.pace, [0.0, np.inf], CertificateError()
         rate = 0.05 * (pace if not self.sizes.units.discrete else 1.0)
         for _ in range(40):
             try:
@@ -222,7 +231,7 @@ class Search:
             except CertificateError:
                 bracket[1] = rate
             low, high = bracket
-            if high < 1e-7 * pace or (low > 0 and high / low < 1.001) or low > 500:
+            if high < 1e-6 * pace or (low > 0 and high / low < 1.001) or low > 500:
                 break
             rate = rate / 8 if not low else rate * 4 if high == np.inf else float(np.sqrt(low * high))
         if best is None:
@@ -312,7 +321,7 @@ class Search:
 
     def _solved(self, eta: float, wanted: Wanted) -> Form:
         if self._checked(wanted) and not self.program.varies:
-            return Form(wanted.P, wanted.W, wanted.R)
+            return Form(wanted.P, wanted.W, wanted.R)  # pyright: ignore[reportArgumentType]
         return self.program.solve(self.points.take(self.active), eta, wanted)
 
     def _rounding(self, form: Form) -> float:

@@ -69,12 +69,12 @@ def unseen_mode(increments: Increments, eta: float) -> str | None:
     best: tuple[float, int, complex, Array] | None = None
     for k, (A, C) in enumerate(zip(jacobians.A, jacobians.C, strict=True)):
         size = max(np.linalg.norm(A, 2), 1e-300)
-        C = C / max(np.linalg.norm(C, 2), 1e-300)
+        seen = C / max(np.linalg.norm(C, 2), 1e-300)
         for s in np.linalg.eigvals(A):
             fades = abs(s) ** 2 < eta * (1 - 1e-9) if units.discrete else 2 * s.real < np.log(eta) - 1e-9 * size
             if fades or s.imag < 0:
                 continue
-            _, values, modes = np.linalg.svd(np.vstack([(A - s * np.eye(len(A))) / size, C]))
+            _, values, modes = np.linalg.svd(np.vstack([(A - s * np.eye(len(A))) / size, seen]))
             if best is None or values[-1] < best[0] * 0.99:
                 best = (float(values[-1]), k, s, modes[-1].conj())
     if best is None or best[0] > 1e-7:

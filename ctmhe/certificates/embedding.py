@@ -19,9 +19,9 @@ H + s (H - c): the combinations are stretched about their mean by 1 + s.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import product
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import product
 from math import comb
 from typing import Any, NamedTuple
 

@@ -58,7 +58,8 @@ class Sizes:
     @property
     def scale(self) -> Array:
         """Of (x, d)."""
-        return block_diag(self.units.x, *(getattr(self.units, group) for group in self.groups))
+        scale: Array = block_diag(self.units.x, *(getattr(self.units, group) for group in self.groups))
+        return scale
 
     def stacked(self, jacobians: Jacobians) -> tuple[Array, Array]:
         """Return f (k, nx, nx + nd) and h (k, ny, nx + nd)."""
@@ -150,7 +151,7 @@ class Program:
         given = [*wanted.W, wanted.R]
         scales = [*(getattr(units, group) for group in sizes.groups), units.y]
         free = wanted.P is None and wanted.objective != "P" and any(w is not None and len(w) for w in given)
-        factor = cp.Variable(nonneg=True) if free else 1.0
+        factor: Any = cp.Variable(nonneg=True) if free else 1.0
         weights = [
             cp.Variable((len(unit), len(unit)), symmetric=True) if w is None else factor * (unit @ w @ unit / self.pace)
             for w, unit in zip(given, scales, strict=True)

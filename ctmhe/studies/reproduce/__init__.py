@@ -12,6 +12,7 @@ from ctmhe.studies.reproduce import (
     study_solves_saved,
     thesis_3_4_1_certificate,
     thesis_3_4_1_ct,
+    thesis_3_4_2_certificate,
     thesis_4_3_3_horizons,
     thesis_5_2_4_horizon,
     thesis_table_3_2,
@@ -26,6 +27,7 @@ CASES: dict[str, Callable[..., dict[str, Any]]] = {
     "thesis-4.3.3-horizons": thesis_4_3_3_horizons.reproduce,
     "thesis-5.2.4-horizon": thesis_5_2_4_horizon.reproduce,
     "certified-runs": certified_runs.reproduce,
+    "thesis-3.4.2-certificate": thesis_3_4_2_certificate.reproduce,
     "study-reactor-budget": study_reactor_budget.reproduce,
     "study-solves-saved": study_solves_saved.reproduce,
 }
