@@ -221,6 +221,8 @@ class Search:
 
     def fastest(self, wanted: Wanted) -> tuple[float, Form]:
         """Return the smallest eta for which a form is found, to one per mille of -ln eta, and the form."""
+        if why := unseen_mode(self.increments, 1.0):
+            raise CertificateError(f"model {self.increments.model.name!r} is not detectable: {why}")
         best: tuple[float, Form] | None = None
         pace, bracket, last = self.program.pace, [0.0, np.inf], CertificateError()
         rate = 0.05 * (pace if not self.sizes.units.discrete else 1.0)
@@ -235,14 +237,9 @@ class Search:
                 break
             rate = rate / 8 if not low else rate * 4 if high == np.inf else float(np.sqrt(low * high))
         if best is None:
-            why = unseen_mode(self.increments, 1.0)
             raise CertificateError(
-                f"model {self.increments.model.name!r} has no quadratic function at any rate on this domain: "
-                + (
-                    f"it is not detectable: {why}"
-                    if why
-                    else "no mode of a linearisation shows why; try a smaller domain"
-                )
+                f"model {self.increments.model.name!r}: no quadratic function at any rate on this domain, although no "
+                "mode of a linearisation that outputs do not see grows. Try a smaller domain"
             )
         for share in (1.0, 0.999, 0.99, 0.9):  # fresh points may ask for less
             eta = float(np.exp(-share * best[0]))

@@ -12,12 +12,14 @@ from ctmhe.studies.reproduce import (
     thesis_3_4_1_certificate,
     thesis_3_4_1_ct,
     thesis_3_4_2_certificate,
+    thesis_printed_certificates,
 )
 
 CASES: dict[str, Callable[..., dict[str, Any]]] = {
     "thesis-3.4.1-ct": thesis_3_4_1_ct.reproduce,
     "thesis-3.4.1-certificate": thesis_3_4_1_certificate.reproduce,
     "thesis-3.4.2-certificate": thesis_3_4_2_certificate.reproduce,
+    "thesis-printed-certificates": thesis_printed_certificates.reproduce,
     "study-reactor-budget": study_reactor_budget.reproduce,
     "study-solves-saved": study_solves_saved.reproduce,
 }
