@@ -38,7 +38,7 @@ def certify_detectability(
     Q: Any = None,
     R: Any = None,
     objective: str | None = None,
-    jacobians: Cover | None = None,
+    jacobians: Cover | Mapping[str, Any] | None = None,
     seed: int = 0,
 ) -> DetectabilityCertificate:
     """Find, or check, a quadratic i-iIOSS Lyapunov function of a model on a domain.
@@ -63,8 +63,10 @@ def certify_detectability(
         otherwise observable models have any. `P`: largest smallest eigenvalue of P, for given Q and R.
         `conditioning`: least condition number of P, in nominal units. `horizon`: shortest horizon
         (3.30); a given P bounds U from above, and the function below it is found; without P the same as `rate`.
-    jacobians : Cover, optional
-        Jacobians of one's own whose hull holds those of the domain: the certificate is as rigorous as they are.
+    jacobians : mapping letter -> (lower, upper), or Cover, optional
+        Bounds of the entries of A, B, C and D (7.32), matrices or scalars, what does not vary left out: for an FMU, whose
+        derivatives can be sampled only. Or Jacobians whose hull holds those of the domain. The certificate is as
+        rigorous as they are.
     seed : int
         Of the fresh points.
 
@@ -85,13 +87,15 @@ def certify_detectability(
     found = _asked(model, eta, rate, objective, P, Q, R)
     increments = Increments(model, domain, u=u)
     demand_continuity(increments)
-    search = Search(increments, jacobians or increments.cover("ABCD"), seed)
+    search = Search(increments, _cover(increments, jacobians), seed)
     eta, form = found.answer(search)
     values, pairs = search.fresh(form, eta, FRESH, seed + 1)
     top = found.wanted.P if found.objective == "horizon" and found.wanted.P is not None else form.P
     notes = list(leaving(increments))
     if search.program.varies:
         notes.insert(0, "outputs are not affine: they enter by a bound that is affine in their Jacobian")
+    if jacobians is not None:
+        notes.insert(0, "the Jacobians, or their bounds, were given: it is as rigorous as they are")
     if not search.cover.rigorous:
         notes.insert(0, f"evidence, not proof: {len(search.points.A)} Jacobians, then {FRESH} fresh points, hold it")
     worst = dict(zip(increments.names, pairs[0, 0].tolist(), strict=True))
@@ -111,6 +115,13 @@ def certify_detectability(
         worst=worst,
         notes=tuple(notes),
     )
+
+
+def _cover(increments: Increments, jacobians: Cover | Mapping[str, Any] | None) -> Cover:
+    if isinstance(jacobians, Cover):
+        return jacobians
+    # MERGE: `given` comes with the covers of `Increments`
+    return increments.cover("ABCD", **({} if jacobians is None else {"given": jacobians}))
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,6 +232,8 @@ class Search:
 
     def fastest(self, wanted: Wanted) -> tuple[float, Form]:
         """Return the smallest eta for which a form is found, to one per mille of -ln eta, and the form."""
+        if why := unseen_mode(self.increments, 1.0):
+            raise CertificateError(f"model {self.increments.model.name!r} is not detectable: {why}")
         best: tuple[float, Form] | None = None
         pace, bracket, last = self.program.pace, [0.0, np.inf], CertificateError()
         rate = 0.05 * (pace if not self.sizes.units.discrete else 1.0)
@@ -235,14 +248,9 @@ class Search:
                 break
             rate = rate / 8 if not low else rate * 4 if high == np.inf else float(np.sqrt(low * high))
         if best is None:
-            why = unseen_mode(self.increments, 1.0)
             raise CertificateError(
-                f"model {self.increments.model.name!r} has no quadratic function at any rate on this domain: "
-                + (
-                    f"it is not detectable: {why}"
-                    if why
-                    else "no mode of a linearisation shows why; try a smaller domain"
-                )
+                f"model {self.increments.model.name!r}: no quadratic function at any rate on this domain, although no "
+                "mode of a linearisation that outputs do not see grows. Try a smaller domain"
             )
         for share in (1.0, 0.999, 0.99, 0.9):  # fresh points may ask for less
             eta = float(np.exp(-share * best[0]))

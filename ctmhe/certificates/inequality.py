@@ -197,8 +197,9 @@ class Program:
         """Return coordinates of x in which those through which nothing varies stay apart from the others: the last."""
         basis = coordinates(self.sizes.units, self.points, self.centre, eta)
         order = np.argsort([constant(self.points.A[:, :, j]) for j in range(len(basis))], kind="stable")
-        basis[order] = np.linalg.cholesky((basis @ basis.T)[np.ix_(order, order)])
-        return basis
+        turned = np.empty_like(basis)
+        turned[order] = np.linalg.qr(basis[order].T)[1].T  # triangular, up to a rotation the same
+        return turned
 
     def _matrices(self, f: Array, h: Array, eta: float, P: Any, weights: list[Any], N: Any) -> list[Any]:
         """Return what has to be positive, one matrix a point: the gap, with Schur complements for f'P f and N."""

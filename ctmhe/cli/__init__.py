@@ -1,4 +1,4 @@
-"""The command line: `ctmhe demo`, `estimate`, `fmu info`, `fmu build`, `study run`, `reproduce`."""
+"""The command line: `ctmhe demo`, `estimate`, `certify`, `fmu info`, `fmu build`, `study run`, `reproduce`."""
 
 from __future__ import annotations
 
@@ -85,6 +85,22 @@ def estimate(
     run.solves_to_pandas().to_csv(out / "solves.csv")
     save_plot(run, out / "estimates.png")
     typer.echo(f"\nwritten: {out / 'run.nc'}, estimates.csv, events.csv, solves.csv, estimates.png")
+
+
+@app.command()
+def certify(
+    file: Annotated[Path, typer.Argument(help="TOML file: tables model, domain, certificate.")],
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write matrices and numbers as JSON.")] = None,
+) -> None:
+    """Certify that a model is detectable on a domain: rate, horizon, longest wait, and how far that is proved."""
+    from ctmhe.studies.certify_file import as_json, certify_file, report
+
+    found = certify_file(file)
+    typer.echo(report(found))
+    if json_file is not None:
+        json_file.parent.mkdir(parents=True, exist_ok=True)
+        json_file.write_text(json.dumps(as_json(found), indent=2) + "\n", encoding="utf-8")
+        typer.echo(f"\nwritten: {json_file}")
 
 
 @fmu_app.command("info")

@@ -119,18 +119,19 @@ def build(tables: Mapping[str, Any]) -> tuple[Plant, MHE]:
 @lru_cache(maxsize=8)
 def _built(plant: str, model: str, estimator: str, thread: int) -> tuple[Plant, MHE]:
     """Return what texts describe; a plant is run by one thread at a time, hence `thread`."""
-    return _plant(json.loads(plant)), build_estimator(_model(json.loads(model)), json.loads(estimator), "study")
+    return _plant(json.loads(plant)), build_estimator(build_model(json.loads(model)), json.loads(estimator), "study")
 
 
 def _plant(table: dict[str, Any]) -> Plant:
     if "fmu" not in table:
-        return OdePlant(_model({key: table[key] for key in LIBRARY if key in table}))
+        return OdePlant(build_model({key: table[key] for key in LIBRARY if key in table}))
     inputs = table.get("inputs")
     options = {key: value for key, value in table.items() if key not in ("fmu", "truth", "inputs")}
     return FmuPlant(table["fmu"], inputs=list(inputs) if inputs is not None else None, **options)
 
 
-def _model(table: dict[str, Any]) -> Model:
+def build_model(table: dict[str, Any]) -> Model:
+    """Return the FMU or the model of the library that a table names."""
     if "fmu" in table:
         return FmuModel(table.pop("fmu"), **table)
     make = choose({name: getattr(library, name) for name in PLANTS}, table["model"], "study: model of the library")

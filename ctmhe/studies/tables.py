@@ -88,7 +88,7 @@ def build_estimator(model: Any, table: Mapping[str, Any], where: str) -> MHE:
             integrator = dict(options.pop("integrator", {"kind": "RK4", "step": options["interval"] / 5}))
             kind = choose(INTEGRATORS, integrator.pop("kind", None), "integrator kind")
             options["integrator"] = kind(**integrator)
-        box = model.bounds if bounds == "model" else Bounds(**{key: _box(value) for key, value in bounds.items()})
+        box = model.bounds if bounds == "model" else Bounds(**{key: box_of(value) for key, value in bounds.items()})
         return MHE(model, cost=DiscountedCost(**cost), bounds=box, **options)
     except TypeError as error:
         raise InputError(f"{where}: table [estimator]: {error}") from None
@@ -122,5 +122,6 @@ def build_guess(table: Mapping[str, Any], model: Any, where: str) -> tuple[dict[
     return guess, {name: guess.pop(name) for name in list(guess) if name in model.p.names} or None
 
 
-def _box(value: Any) -> Any:
+def box_of(value: Any) -> Any:
+    """Return a box of `Bounds`: a table of pairs, or one pair for all."""
     return {name: tuple(pair) for name, pair in value.items()} if isinstance(value, Mapping) else tuple(value)

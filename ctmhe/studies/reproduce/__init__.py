@@ -15,6 +15,7 @@ from ctmhe.studies.reproduce import (
     thesis_3_4_2_certificate,
     thesis_4_3_3_horizons,
     thesis_5_2_4_horizon,
+    thesis_printed_certificates,
     thesis_table_3_2,
     thesis_table_4_2,
 )
@@ -28,6 +29,7 @@ CASES: dict[str, Callable[..., dict[str, Any]]] = {
     "thesis-5.2.4-horizon": thesis_5_2_4_horizon.reproduce,
     "certified-runs": certified_runs.reproduce,
     "thesis-3.4.2-certificate": thesis_3_4_2_certificate.reproduce,
+    "thesis-printed-certificates": thesis_printed_certificates.reproduce,
     "study-reactor-budget": study_reactor_budget.reproduce,
     "study-solves-saved": study_solves_saved.reproduce,
 }

@@ -1,4 +1,4 @@
-"""Thesis 3.4.1, continuous time: the certificate of the batch reactor checked, found again, and what faster ones cost."""
+"""Thesis 3.4.1, continuous time: the reactor's certificate checked, found again, and what faster ones cost."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WEIGHTS: dict[str, Any] = {"Q": Q, "R": R}
 
 
 def printed_margin() -> float:
-    """Return the smallest eigenvalue of (7.33), sign changed, at both vertices, for the printed matrices as they stand."""
+    """Return the smallest eigenvalue of (7.33), sign changed, for the printed matrices, in their own units."""
     model = batch_reactor()
     plain = Units(np.eye(2), np.eye(3), np.eye(1), np.eye(0), discrete=False)
     form = Form(P, (Q,), np.array([[R]]))
@@ -88,9 +88,9 @@ def reproduce(*, seeds: int = 1, workers: int = 1, progress: bool = False) -> di
 COMMENT = (
     "The printed P is the optimum to its last digit, rounded: (7.33) then fails by 6e-5. The Jacobian depends on pA "
     "alone and is affine in it, so two vertices prove it for every pB and w. There is no best rate: on what the gauge "
-    "does not show, v = (1, -1), (7.33) asks for -ln(eta) v'Pv <= 2 (2 k1 pA + k2) v'P (2, -1), which some P > 0 meets at "
-    "any rate, and scaling it down admits the printed Q and R. P becomes singular on the way: `faster` has its smallest "
-    "eigenvalue, `best_eta` the rate at which noise of nominal size (1 bar, 0.1 for w) weighs `largest_gain` times as "
-    "much as errors of that size, for the printed ratio of Q to R; `best_eta_any_weights` the same for Q and R that are "
-    "free."
+    "does not show, v = (1, -1), (7.33) asks for -ln(eta) v'Pv <= 2 (2 k1 pA + k2) v'P (2, -1), which some P > 0 meets "
+    "at any rate, and scaling it down admits the printed Q and R. P becomes singular on the way: `faster` has its "
+    "smallest eigenvalue. `best_eta` is the rate at which noise of nominal size (1 bar, 0.1 for w) weighs "
+    "`largest_gain` times as much as errors of that size, for the printed Q and R; `best_eta_any_weights` the same for "
+    "free ones."
 )

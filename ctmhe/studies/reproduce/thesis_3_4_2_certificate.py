@@ -94,8 +94,8 @@ def reproduce(*, seeds: int = 1, workers: int = 1, progress: bool = False) -> di
 
 
 COMMENT = (
-    "The thesis prints eta and the horizon, no matrices, and no certificate in continuous time. Ours are for its domain: "
-    "`t_min` is in steps for `discrete` (its horizon of 30 exceeds it), in seconds for `continuous`, whose eta is 0.87 "
-    "per 0.05 s. `method` says how the domain was covered: `grid` is evidence, as in the thesis, at 2000 random points, "
-    "corners, and the points that a local search finds worst; `interval` is a proof."
+    "The thesis prints eta and the horizon, no matrices, and no certificate in continuous time. Ours are for its "
+    "domain: `t_min` is in steps for `discrete` (its horizon of 30 exceeds it), in seconds for `continuous`, whose eta "
+    "is 0.87 per 0.05 s. `method` says how the domain was covered: `grid` is evidence, as in the thesis, at 2000 "
+    "random points, corners, and the points that a local search finds worst; `interval` is a proof."
 )
