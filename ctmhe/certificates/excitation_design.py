@@ -238,7 +238,12 @@ def _verified(made: ExcitationDesign, points: Jacobians, round_: int) -> tuple[E
 def regressor_bound(made: ExcitationDesign) -> Array | None:
     """Return H of (7.68) if f is affine in p, outputs are linear, and the regressor varies only with what they show."""
     increments, place = made.increments, made.increments.place["p"]
-    v = np.vstack([increments.random(200, np.random.default_rng(6)), increments.corners()])
+    rng = np.random.default_rng(6)
+    v = np.vstack([increments.random(200, rng), increments.corners()])
+    moved = v.copy()
+    moved[:, place] = increments.random(len(v), rng)[:, place]
+    if not np.allclose(increments.at(v).E, increments.at(moved).E, rtol=1e-9):
+        return None  # before it is asked for p = 0, where a model need not be defined
     zero, double = v.copy(), v.copy()
     zero[:, place], double[:, place] = 0.0, 2 * v[:, place]
     here, none, twice = (increments.at(points) for points in (v, zero, double))
