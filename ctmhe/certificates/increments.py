@@ -277,7 +277,8 @@ def _pruned(jacobians: Jacobians, which: str) -> Jacobians:
 def _farthest(jacobians: Jacobians, which: str) -> Jacobians:
     """Return those that are farthest out in random directions, a few dozen: of samples, what a program has to see."""
     flat = np.concatenate([getattr(jacobians, letter).reshape(len(jacobians.A), -1) for letter in which], axis=1)
-    flat = (flat - flat.mean(axis=0)) / np.maximum(np.ptp(flat, axis=0), 1e-300)
+    width = np.ptp(flat, axis=0)
+    flat = (flat - flat.mean(axis=0)) / np.where(width > 1e-11 * np.abs(flat).max(), width, np.inf)
     directions = np.random.default_rng(0).normal(size=(flat.shape[1], KEPT))
     return jacobians.take(np.unique((flat @ directions).argmax(axis=0)))
 
