@@ -98,7 +98,8 @@ def design_excitation(
     linear = constant(points.C) and constant(points.D)
     compensated = linear and not constant(points.A)
     unseen = np.eye(len(units.x)) - units.right_inverse(centre.C[0]) @ centre.C[0]
-    fixed = linear and constant(points.A @ unseen)
+    samples = increments.at(increments.random(64, np.random.default_rng(2)))
+    fixed = linear and constant(np.concatenate([points.A, samples.A]) @ unseen)
     pace = units.pace(centre)
     T = 200.0 / pace if horizon is None else positive("design_excitation: horizon", horizon)
     if not units.discrete and 1.1 * np.log(4) / T > FASTEST:
@@ -106,7 +107,6 @@ def design_excitation(
             f"design_excitation: to contract within {T:.2g} s, W would have to fade by less than exp(-{FASTEST:g}) per "
             "second; give a longer horizon=, or a model that counts milliseconds"
         )
-    samples = increments.at(increments.random(64, np.random.default_rng(2)))
 
     def attempt(factor: float, least: float, speed: float) -> tuple[float, Any]:
         noise, *found, L = design(units, points, centre, factor, T, compensated=compensated, least=least, speed=speed)
@@ -238,7 +238,12 @@ def _verified(made: ExcitationDesign, points: Jacobians, round_: int) -> tuple[E
 def regressor_bound(made: ExcitationDesign) -> Array | None:
     """Return H of (7.68) if f is affine in p, outputs are linear, and the regressor varies only with what they show."""
     increments, place = made.increments, made.increments.place["p"]
-    v = np.vstack([increments.random(200, np.random.default_rng(6)), increments.corners()])
+    rng = np.random.default_rng(6)
+    v = np.vstack([increments.random(200, rng), increments.corners()])
+    moved = v.copy()
+    moved[:, place] = increments.random(len(v), rng)[:, place]
+    if not np.allclose(increments.at(v).E, increments.at(moved).E, rtol=1e-9):
+        return None  # before it is asked for p = 0, where a model need not be defined
     zero, double = v.copy(), v.copy()
     zero[:, place], double[:, place] = 0.0, 2 * v[:, place]
     here, none, twice = (increments.at(points) for points in (v, zero, double))

@@ -147,8 +147,8 @@ def certify_jointly(design: ExcitationDesign, *, alpha: float, S_0: Any = None) 
     alpha : float
         A level in y's units squared; what `ExcitationMonitor` finds on the trajectories that are expected.
     S_0 : array (np, np), optional
-        Weight of the parameters' prior in (7), positive definite; of level alpha when left out. The smaller, the less a wrong
-        prior counts and the faster U contracts.
+        Weight of the parameters' prior in (7), positive definite; of level alpha when left out. The smaller, the less
+        a wrong prior counts and the faster U contracts.
 
     Raises
     ------
@@ -189,8 +189,8 @@ def search_jointly(
 ) -> JointCertificate:
     """Return the joint certificate with the least error of parameters in the long run; lambda is searched too.
 
-    For windows like the expected one and w of nominal size, by (9) of paper 000: 4 times the sum of lambda^(j-1) |w|^2_Q,
-    over 1 - rho, over the window's level. Slow fading averages more noise, fast fading contracts more: rho < 1 by the
+    For windows like the expected one and w of nominal size, by (9) of paper 000: the sum of 4 lambda^(j-1) |w|^2_Q over
+    1 - rho and over the window's level. Slow fading averages more noise, fast fading contracts more: rho < 1 by the
     window's own kappa (33). alpha is half the level of the expected window.
 
     Parameters

@@ -135,6 +135,8 @@ class JointWeights:
     eta_1, eta_2, eta_x, eta_p : float
     ratio : float
         lambda_max(P_p, P_upper), of gamma.
+    scale : float
+        By which U was scaled: `states.scaled(weights.scale)` is what they are for.
     """
 
     W: Array
@@ -146,6 +148,7 @@ class JointWeights:
     eta_x: float
     eta_p: float
     ratio: float
+    scale: float = 1.0
 
     def gamma(self, s: Any) -> Any:
         """Return gamma(s) of (5.10), s a number or an array."""
@@ -201,7 +204,7 @@ def joint_weights(
     if B_p is not None:
         Q = Q + np.transpose(B_p) @ V @ np.asarray(B_p)
     W, R = 2 * states.P_upper, states.R + excited.R
-    return JointWeights(frozen(W), frozen(V), frozen(Q), frozen(R), eta_1, eta_2, states.eta, excited.eta, ratio)
+    return JointWeights(frozen(W), frozen(V), frozen(Q), frozen(R), eta_1, eta_2, states.eta, excited.eta, ratio, scale)
 
 
 def unmet(weights: JointWeights, states: StateDetectability, excited: ExcitedSet) -> tuple[str, ...]:

@@ -16,6 +16,7 @@ from scipy.linalg import block_diag
 from ctmhe import MHE, DiscountedCost, Excitation, MaxInterval, SingleSample, Uniform, simulate
 from ctmhe.certificates.excitation import ExcitationMonitor
 from ctmhe.certificates.excitation_design import design_excitation
+from ctmhe.certificates.joint import certify_jointly
 from ctmhe.errors import InputError
 from ctmhe.models.library import chua, chua_discrete
 from ctmhe.triggers import WindowExcitation
@@ -77,6 +78,19 @@ def test_where_the_design_is_global_one_trajectory_speaks_for_every_pair(name, s
     first = trajectory(watch.design.model, 15, rng, h=0.05)
     second = trajectory(watch.design.model, 15, rng, h=0.05, u=first.u0)
     np.testing.assert_allclose(watch.between(first, second).matrix, watch.along(first).matrix, rtol=1e-8, atol=1e-12)
+
+
+def test_levels_do_not_depend_on_the_unit_of_a_parameter():
+    """A gain in thousandths: the level, what the set says of the parameters, and kappa stay."""
+    plain, milli = (ExcitationMonitor(design_excitation(mixer(unit=unit), u=(-1, 1), mu=0.8)) for unit in (1.0, 1e3))
+    run = trajectory(plain.design.model, 20, np.random.default_rng(0))
+    other = replace(run, p=run.p * [1e3, 1.0])
+    level = plain.level(run)
+    assert milli.level(other) == pytest.approx(level, rel=1e-6)
+    sets = plain.design.excited_set(level), milli.design.excited_set(level)
+    assert other.p @ sets[1].S @ other.p == pytest.approx(run.p @ sets[0].S @ run.p)
+    kappas = [certify_jointly(watch.design, alpha=level).kappa for watch in (plain, milli)]
+    assert kappas[1] == pytest.approx(kappas[0], rel=1e-2)
 
 
 def test_the_sums_are_the_printed_ones():

@@ -16,7 +16,7 @@ from ctmhe.certificates.excitation_design import design_excitation, filter_bound
 from ctmhe.certificates.injection import least_upper_bound, phi_factor
 from ctmhe.errors import CertificateError, InputError
 from ctmhe.models import ContinuousModel, DiscreteModel
-from ctmhe.models.library import batch_reactor, chua, chua_discrete
+from ctmhe.models.library import batch_reactor, chua, chua_discrete, cstr
 from ctmhe.types import Bounds
 from tests.certificates.trajectories import decay, inside, mixer, quadratic, rate, trajectory
 
@@ -268,3 +268,49 @@ def test_bad_requests_are_explained():
     ):
         with pytest.raises(InputError, match=words):
             call()
+
+
+def reactor_in(units: np.ndarray) -> tuple[ContinuousModel, Bounds]:
+    """The batch reactor with pressures, output, rates and time counted in other units: factors (5,)."""
+    a, b, y, k, s = units
+    nominal = {"a": a, "b": b, "y": y, "k1": 0.16 * k, "k2": 0.03 * k, "w_a": 0.1, "w_b": 0.1, "v": 0.1}
+
+    def f(t, x, u, w, p):
+        rate = (p[0] * (x[0] / a) ** 2 - p[1] * x[1] / b) / k
+        return a * (w[0] - 2 * rate) / s, b * (rate + w[1]) / s
+
+    model = ContinuousModel(
+        f, lambda t, x, u, w, p: [y * (x[0] / a + x[1] / b + w[2])],
+        x=("a", "b"), w=("w_a", "w_b", "v"), p=("k1", "k2"), y="y", nominal=nominal, name="reactor",
+    )  # fmt: skip
+    box = {"k1": (0.1 * k, 0.25 * k), "k2": (0.02 * k, 0.05 * k)}
+    return model, Bounds(x={"a": (0.1 * a, 3 * a), "b": (0.1 * b, 3 * b)}, w=(-0.1, 0.1), p=box)
+
+
+@given(seed=st.integers(0, 10**6))
+@settings(max_examples=5)
+def test_units_do_not_decide_whether_there_is_a_design(seed):
+    """Pressures, outputs, rates and seconds in any unit: the same weight R, in nominal units, to the solver."""
+    rng = np.random.default_rng(seed)
+    units = 10.0 ** rng.uniform(-3, 3, 5)
+    units[4] = 10 ** rng.uniform(-1, 3)
+    (plain, box), (other, domain) = reactor_in(np.ones(5)), reactor_in(units)
+    first, second = design_excitation(plain, box, mu=0.95), design_excitation(other, domain, mu=0.95 ** (1 / units[4]))
+    assert first.rigorous and second.rigorous and second.margin >= -1e-10
+    assert second.R[0, 0] == pytest.approx(first.R[0, 0], rel=1e-3)
+
+
+def test_why_there_is_no_design_is_told_in_names():
+    """The level of the stirred tank is no more seen in the temperature somewhere in its box, and does not fade."""
+    tank = cstr(parameters=("U",))
+    with pytest.raises(CertificateError, match=r"outputs hardly see the mode \(c .*, T .*, h 1\) with eigenvalue 0,"):
+        design_excitation(
+            tank, Bounds(x=tank.bounds.x, p={"U": (40, 70)}), u={"T_c": (290, 310), "F": (0.09, 0.11)}, mu=0.999
+        )
+
+
+def test_a_stiff_reactor_near_its_steady_state_has_a_design():
+    """Exponentials: evidence. One parameter, times of minutes, states of 1 and of 300."""
+    near = Bounds(x={"c": (0.8, 0.95), "T": (320, 330), "h": (0.63, 0.69)}, p={"U": (45, 65)})
+    made = design_excitation(cstr(parameters=("U",)), near, u={"T_c": (295, 305), "F": (0.095, 0.105)}, mu=0.999)
+    assert made.margin >= 0 and not made.rigorous and made.scope == "local"

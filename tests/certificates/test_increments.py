@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from ctmhe.certificates.increments import Increments
 from ctmhe.errors import InputError
 from ctmhe.models import ContinuousModel
-from ctmhe.models.library import chua, chua_discrete, cstr, van_der_pol
+from ctmhe.models.library import chua, chua_discrete, cstr, quadrotor, van_der_pol
 from ctmhe.types import Bounds
 from tests.certificates.trajectories import decay, mixer
 
-settings.register_profile("certificates", deadline=None, max_examples=40)
+settings.register_profile("certificates", deadline=None, max_examples=15)
 settings.load_profile("certificates")
 
 
@@ -106,3 +106,13 @@ def test_exponential_rates_are_sampled():
     """The stirred tank reactor: Arrhenius terms are no polynomials."""
     model = cstr(parameters=("k0",))
     assert not Increments(model, Bounds(x=(0.5, 350.0), p=(7e10, 7.4e10)), u=(0.05, 320.0)).cover().rigorous
+
+
+def test_a_grid_has_points_all_over():
+    """Entries that are constant but for rounding do not hide those that vary: the quadrotor's angles turn A."""
+    angles, rates = dict.fromkeys(("phi", "theta", "psi"), (-0.5, 0.5)), dict.fromkeys(("O1", "O2", "O3"), (-1, 1))
+    increments = Increments(quadrotor(), Bounds(x=angles | rates), u=(500, 900))
+    cover = increments.cover("ABCD")
+    assert cover.method == "grid" and len(cover.jacobians.A) > 20
+    there = increments.at(increments.random(50, np.random.default_rng(0))).A
+    assert np.ptp(cover.jacobians.A, axis=0).max() > 0.8 * np.ptp(there, axis=0).max()

@@ -22,6 +22,7 @@ from ctmhe.certificates.joint import (
     certify_jointly,
     joint_bound,
     lyapunov_matrix,
+    search_jointly,
     uniform_excitation,
     young_weights,
 )
@@ -34,7 +35,7 @@ from ctmhe.certificates.joint_weights import (
 )
 from ctmhe.errors import CertificateError, InputError
 from ctmhe.models import DiscreteModel
-from ctmhe.models.library import chua, chua_discrete
+from ctmhe.models.library import batch_reactor, chua, chua_discrete
 from ctmhe.types import Bounds
 from tests.certificates.trajectories import decay, mixer, quadratic, trajectory
 
@@ -89,6 +90,35 @@ def test_the_horizon_is_the_shortest_that_contracts():
     assert joint.rho(joint.horizon) < 1 <= joint.rho(joint.horizon - 1)
     flow = certify_jointly(design("decay"), alpha=1.0)
     assert flow.rho(flow.horizon) == pytest.approx(1.0)
+
+
+def test_the_searched_factor_is_no_worse_than_others():
+    """tr Q / -ln eta / (1 - rho) / level, the long-run error by (9) of paper 000, against a few other factors."""
+    model = decay()
+    window = trajectory(model, 60, np.random.default_rng(0), h=0.1, x=[2.0], p=[0.8], size=0.0)
+    w = Units.of(model).w
+
+    def error(joint):
+        level = ExcitationMonitor(joint.design).along(window).level
+        return np.trace(w @ joint.Q @ w) / -np.log(joint.eta) / (1 - joint.check(window).rho) / level
+
+    found = search_jointly(model, window, u=(-1, 1))
+    assert found.check(window) and found.check(window).rho < 1
+    others = [certify_jointly(design("decay", mu), alpha=found.alpha) for mu in (0.2, 0.5)]
+    assert error(found) <= 1.05 * min(map(error, others))
+    none = np.zeros_like(window.u0)
+    still = replace(window, x=np.zeros_like(window.x), u0=none, u1=none)
+    with pytest.raises(CertificateError, match="says nothing of"):
+        search_jointly(model, still, u=(-1, 1))
+
+
+@pytest.mark.parametrize("eta", [0.35, 0.4, 0.9])
+def test_state_detectability_is_found_at_any_slow_enough_rate(eta):
+    """Rates at which the solver once failed, or the check used Jacobians that belong to no pair."""
+    assert detect_states(chua(), eta=eta).margin >= -1e-9
+    rates = {"k1": (0.1, 0.25)}
+    found = detect_states(batch_reactor(parameters=("k1",)), Bounds(x=(0.1, 5), w=(-0.1, 0.1), p=rates), eta=eta)
+    assert found.margin >= -1e-9 and found.rigorous
 
 
 def test_conditions_along_a_run_tell_excitation_from_rest():

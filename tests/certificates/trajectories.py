@@ -66,11 +66,11 @@ def one_trajectory(model, steps, rng, *, h=None, size=1.0, x=None, p=None, u=Non
     return Trajectory(h * np.arange(steps + 1), np.array(states), w, np.array(y), u, u, p)
 
 
-def mixer(*, unseen=False) -> DiscreteModel:
+def mixer(*, unseen=False, unit=1.0) -> DiscreteModel:
     """Two states, two parameters: one drives what is seen, the other scales the input; or, unseen, nothing at all."""
     return DiscreteModel(
         lambda t, x, u, w, p: (
-            0.8 * x[0] + 0.2 * x[1] + p[0] * u[0] + w[0],
+            0.8 * x[0] + 0.2 * x[1] + p[0] / unit * u[0] + w[0],
             0.9 * x[1] + (0.0 if unseen else p[1] * x[0]) + 0.1 * u[0] + w[1],
         ),
         lambda t, x, u, w, p: x[0] + w[2],
@@ -80,7 +80,7 @@ def mixer(*, unseen=False) -> DiscreteModel:
         w=("w_a", "w_b", "v"),
         p=("gain", "feed"),
         y="y",
-        bounds=Bounds(x=(-2, 2), w=(-0.1, 0.1), p={"gain": (0.5, 1.5), "feed": (-0.2, 0.1)}),
+        bounds=Bounds(x=(-2, 2), w=(-0.1, 0.1), p={"gain": (0.5 * unit, 1.5 * unit), "feed": (-0.2, 0.1)}),
         name="mixer",
     )
 
