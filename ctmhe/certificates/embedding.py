@@ -19,9 +19,9 @@ H + s (H - c): the combinations are stretched about their mean by 1 + s.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import product
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import product
 from math import comb
 from typing import Any, NamedTuple
 
@@ -305,12 +305,13 @@ def _stretch(points: Array, left: Array) -> float:
     equal = np.vstack([np.hstack([inner.T, np.zeros((inner.shape[1], 1))]), [*np.ones(len(inner)), 0.0]])
     cost = np.append(np.zeros(len(inner)), -1.0)
     for k, rest in enumerate(left):
+        reached = np.inf
         for sign in (-1.0, 1.0):
             equal[k, -1] = sign
             best = linprog(cost, A_eq=equal, b_eq=[*np.zeros(len(left)), 1.0], bounds=(0, None), method="highs")
-            reached = min(reached, -best.fun) if sign > 0 else -best.fun
+            reached = min(reached, -best.fun) if best.status == 0 else 0.0
         equal[k, -1] = 0.0
-        stretch += 1.01 * rest / reached if reached > 1e-9 else np.inf  # the program is solved to 1e-7
+        stretch += 1.01 * rest / reached if reached > 1e-5 else np.inf  # the program is solved to 1e-7
         if stretch > STRETCH:
             break
     return stretch

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from ctmhe.certificates.increments import Increments
 from ctmhe.errors import InputError
 from ctmhe.models import ContinuousModel
-from ctmhe.models.library import chua, chua_discrete, cstr, van_der_pol
+from ctmhe.models.library import chua, chua_discrete, van_der_pol
 from ctmhe.types import Bounds
 from tests.certificates.trajectories import decay, mixer
 
@@ -68,8 +68,8 @@ def test_no_point_lies_outside_a_rigorous_hull(name, which, seed):
     assert (inside @ direction).max() <= (hull @ direction).max() + 1e-9
 
 
-def test_the_method_is_named_and_a_grid_is_no_proof():
-    """Constant, multi-affine, polynomial; anything else is sampled and says so; kinks are not trusted."""
+def test_the_method_is_named_and_every_one_is_a_proof():
+    """Constant, multi-affine, polynomial; anything else is bounded, kinks too."""
     linear = one("linear", lambda t, x, u, w, p: (x[1], -x[0] + p[0]))
     bilinear = one("bilinear", lambda t, x, u, w, p: (x[1], -p[0] * x[0]), x=(-1, 1), p=(1, 2))
     cubic = one("cubic", lambda t, x, u, w, p: (x[1], -p[0] * x[0] ** 3), x=(-1, 1), p=(1, 2))
@@ -78,7 +78,7 @@ def test_the_method_is_named_and_a_grid_is_no_proof():
     said = {m.name: (Increments(m).cover().method, Increments(m).cover().rigorous) for m in (linear, bilinear, cubic)}
     assert said == {"linear": ("constant", True), "bilinear": ("vertices", True), "cubic": ("bernstein", True)}
     for model in (sine, kink):
-        assert (Increments(model).cover().method, Increments(model).cover().rigorous) == ("grid", False)
+        assert (Increments(model).cover().method, Increments(model).cover().rigorous) == ("interval", True)
 
 
 def test_only_signals_that_matter_need_bounds():
@@ -100,9 +100,3 @@ def test_time_is_refused_with_a_remedy():
     """A Jacobian that moves with time has no range."""
     with pytest.raises(InputError, match="depends on time: make what changes with time a known input"):
         Increments(one("clock", lambda t, x, u, w, p: (ca.sin(t) * x[1], -x[0]), x=(-1, 1)))
-
-
-def test_exponential_rates_are_sampled():
-    """The stirred tank reactor: Arrhenius terms are no polynomials."""
-    model = cstr(parameters=("k0",))
-    assert not Increments(model, Bounds(x=(0.5, 350.0), p=(7e10, 7.4e10)), u=(0.05, 320.0)).cover().rigorous
