@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 from scipy.linalg import qr
-from scipy.optimize import linprog
+from scipy.optimize import linprog, nnls
 from scipy.spatial import ConvexHull, QhullError
 
 from ctmhe.certificates.interval import Enclosure, Intervals
@@ -324,7 +324,13 @@ def outermost(points: Array) -> np.ndarray:
         keep = np.array([points[:, 0].argmin(), points[:, 0].argmax()])
     elif 2 <= points.shape[1] <= 5 and len(points) > points.shape[1] + 1:
         with suppress(QhullError):
-            keep = np.sort(ConvexHull(points).vertices)
+            scaled = (points - points.mean(axis=0)) / np.maximum(np.ptp(points, axis=0), 1e-300)
+            hull = ConvexHull(scaled)
+            corners = np.vstack([scaled[hull.vertices].T, np.ones(len(hull.vertices))])
+            far = (hull.equations[:, :-1] @ scaled.T + hull.equations[:, -1:]).max(axis=0) > -1e-8
+            far[hull.vertices] = False  # near a facet: Qhull merges facets, and may have lost some
+            lost = [k for k in np.flatnonzero(far) if nnls(corners, np.append(scaled[k], 1.0))[1] > 1e-11]
+            keep = np.sort([*hull.vertices, *lost])
     return keep
 
 
