@@ -46,7 +46,8 @@ def farthest_outside(increments, cover, which="ABCD", seed=0, count=60) -> float
     points = np.vstack([increments.random(2000, rng), increments.corners()])
     hull, inside = flat(cover.jacobians, which), flat(increments.at(points), which)
     worst = -np.inf
-    for direction in rng.normal(size=(count, hull.shape[1])) / np.maximum(np.ptp(inside, axis=0), 1e-9):
+    scale = np.ptp(inside, axis=0)
+    for direction in rng.normal(size=(count, hull.shape[1])) / np.where(scale > 1e-9, scale, 1.0):
         ours, theirs = inside @ direction, (hull @ direction).max()
         worst = max(worst, (ours.max() - theirs) / max(np.ptp(ours), 1e-9))
     return worst
