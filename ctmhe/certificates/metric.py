@@ -36,7 +36,7 @@ import numpy as np
 
 from ctmhe.certificates.certificate import DetectabilityCertificate
 from ctmhe.certificates.embedding import DEGREE, bernstein, combined, degrees_of, is_rough
-from ctmhe.certificates.increments import Increments
+from ctmhe.certificates.increments import Increments, constant
 from ctmhe.certificates.injection import Units, least_upper_bound
 from ctmhe.certificates.interval import Enclosure
 from ctmhe.certificates.lmi import require_cvxpy, solved
@@ -124,8 +124,11 @@ class _Search:
             raise InputError(f"certify_metric: eta must lie in (0, 1), got {eta}")
         if model.p:
             raise InputError(
-                f"certify_metric: fix the parameters {', '.join(model.p.names)} of model {model.name!r} first"
+                f"certify_metric: model {model.name!r} has parameters: fix {', '.join(model.p.names)} first"
             )
+        samples = increments.at(increments.random(20, np.random.default_rng(5)))
+        if not (constant(samples.C) and constant(samples.D)):
+            raise InputError(f"certify_metric: outputs of model {model.name!r} are not affine in x and w (Remark 7.1)")
         C = increments.at(increments.centre).C[0]
         seen = np.flatnonzero(np.abs(C).any(axis=0))
         rows = np.count_nonzero(C, axis=1)
@@ -230,16 +233,13 @@ class _Search:
                 "take cover='grid' (evidence), or a constant P"
             )
         theta = cp.Variable(len(self.free))
-        weights = {
-            letter: self._matrix(theta, letter, 0)
-            for letter in "QR"
-            if getattr(self.model, {"Q": "w", "R": "y"}[letter])
-        }
-        constraints: list[Any] = [weight >> 0 for weight in weights.values()]
+        weights = [self._matrix(theta, letter, 0) for letter in ("QR" if self.model.w else "R")]
+        constraints: list[Any] = [weight >> SLACK * np.eye(weight.shape[0]) for weight in weights]
         shape = self._shape()
+        upper, one = cp.Variable(), np.eye(len(self.nominal))
         for row in shape:
             P = sum(row[k] * self._matrix(theta, "P", k) for k in range(len(self.powers)))
-            constraints += [P >> np.eye(len(self.nominal))]
+            constraints += [P >> one, P << upper * one]
         gram, values = None, None
         if cover == "squares":
             gram = squares(self._size(), self.degrees[self.varying], extra=extra)
@@ -248,14 +248,8 @@ class _Search:
         else:
             values = self._grid() if cover == "grid" else self._coefficients(pieces)
             constraints += [self._joined(theta, value) >> SLACK * np.eye(self._size()) for value in values]
-        gain: Any = sum(cp.trace(weight) for weight in weights.values())
+        gain: Any = sum(cp.trace(weight) for weight in weights)
         constraints.append(gain <= LARGEST)
-        upper = cp.Variable()
-        constraints += [
-            sum(row[k] * self._matrix(theta, "P", k) for k in range(len(self.powers)))
-            << upper * np.eye(len(self.nominal))
-            for row in shape
-        ]
         solved(cp.Problem(cp.Minimize(gain + upper), constraints))
         if gram is not None:
             worth = gram.worth(np.tensordot(values, theta.value, (1, 0)), SLACK)
@@ -303,22 +297,15 @@ class _Search:
         return combined(lambda s: self.terms(self._inside(s)).reshape(len(s), -1), rules).reshape(-1, *shape)
 
     def _grid(self) -> Array:
-        points = self.increments.random(SAMPLES, np.random.default_rng(0))
-        return self.terms(
-            np.vstack([points, self._inside(np.random.default_rng(1).choice([-1.0, 1.0], (64, len(self.varying))))])
-        )
+        rng = np.random.default_rng(0)
+        corners = self._inside(rng.choice([-1.0, 1.0], (64, len(self.varying))))
+        return self.terms(np.vstack([self.increments.random(SAMPLES, rng), corners]))
 
     def _shape(self) -> Array:
         """Return Bernstein coefficients of the monomials: P lies between what they make of the P_k."""
         degree, place = self.powers.max(initial=0), self.increments.place["x"]
-        rules = [
-            bernstein(
-                self.increments.lower[place][i] / self.nominal[i],
-                self.increments.upper[place][i] / self.nominal[i],
-                degree,
-            )
-            for i in self.within
-        ]
+        lower, upper = (side[place] / self.nominal for side in (self.increments.lower, self.increments.upper))
+        rules = [bernstein(lower[i], upper[i], int(degree)) for i in self.within]
         if not rules:
             return np.ones((1, 1))
         powers = self.powers[:, self.within]
