@@ -119,13 +119,27 @@ def test_discrete_time_too():
     model = DiscreteModel(
         lambda t, x, u, w, p: (x[0] / 2 + w[0] / 2, x[1] + (x[1] ** 2 - x[1]) / 2),
         lambda t, x, u, w, p: x[0],
-        x=("a", "b"), w="w", y="y", step=1.0, bounds=Bounds(x={"a": (0, 1), "b": (0, 0.6)}, w=(0, 1)), name="steps",
+        x=("a", "b"), w="w", y="y", step=1.0, bounds=Bounds(x={"a": (0, 1), "b": (-0.1, 0.6)}, w=(0, 1)), name="steps",
     )  # fmt: skip
     with pytest.raises(CertificateError):
         certify_metric(model, eta=0.97, degree=0)
     found = certify_metric(model, eta=0.97, degree=2).certificate
     assert found.rigorous
     assert found.step == 1.0
+
+
+def test_squares_lose_less_than_bernstein_coefficients():
+    """b' = -b - 0.8 b (a - b)^2, b hidden: eta is at least 0.2307, from the largest slope; quadratic in two signals."""
+    model = ContinuousModel(
+        lambda t, x, u, w, p: (-x[0] + w[0], -x[1] * (1 + 0.8 * (x[0] - x[1]) ** 2)), lambda t, x, u, w, p: x[0],
+        x=("a", "b"), w="w", y="y", bounds=Bounds(x=(-1, 1)), name="two",
+    )  # fmt: skip
+    a, b = np.meshgrid(*2 * [np.linspace(-1, 1, 401)])
+    limit = np.exp(2 * (-1 - 0.8 * (a - b) * (a - 3 * b)).max())
+    assert certify_metric(model, eta=1.05 * limit, degree=0, cover="squares").certificate.rigorous
+    for cover, eta in (("bernstein", 1.25 * limit), ("squares", 0.99 * limit)):
+        with pytest.raises(CertificateError):
+            certify_metric(model, eta=eta, degree=0, cover=cover, pieces=4)
 
 
 def test_a_domain_that_is_left_is_no_proof():
