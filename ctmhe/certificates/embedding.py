@@ -336,8 +336,8 @@ def outermost(points: Array) -> np.ndarray:
 
 def _free(flat: Array) -> np.ndarray:
     """Return columns of samples in which the others are affine."""
-    upper, order = qr(flat - flat.mean(axis=0), mode="r", pivoting=True)
-    sizes = np.abs(np.diag(upper))
+    found: Any = qr(flat - flat.mean(axis=0), mode="r", pivoting=True)
+    sizes, order = np.abs(np.diag(found[0])), found[1]
     return np.sort(order[: int((sizes > 1e-10 * max(sizes[0], 1e-300)).sum())])
 
 

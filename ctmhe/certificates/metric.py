@@ -238,11 +238,11 @@ class _Search:
         shape = self._shape()
         upper, one = cp.Variable(), np.eye(len(self.nominal))
         for row in shape:
-            P = sum(row[k] * self._matrix(theta, "P", k) for k in range(len(self.powers)))
+            P: Any = sum(row[k] * self._matrix(theta, "P", k) for k in range(len(self.powers)))
             constraints += [P >> one, P << upper * one]
         gram, values = None, None
         if cover == "squares":
-            gram = squares(self._size(), self.degrees[self.varying], extra=extra)
+            gram = squares(self._size(), self.degrees[self.varying].tolist(), extra=extra)
             values = self.terms(self._inside(gram.nodes))
             constraints += gram.constraints([self._joined(theta, value) for value in values], SLACK)
         else:
