@@ -49,8 +49,8 @@ def _applied(code: int, a: Series, b: Series) -> Series:
     if code in LINEAR:
         return LINEAR[code](a, b)
     if still:
-        value: Any = UNARY[code](*a[0]) if code in UNARY else BINARY[code](*a[0], *b[0])
-        return [outward(value), *[None] * (len(a) - 1)]
+        bounds: Any = UNARY.get(code) or BINARY[code]
+        return [outward(bounds(*a[0]) if code in UNARY else bounds(*a[0], *b[0])), *[None] * (len(a) - 1)]
     if code in ANALYTIC:
         return ANALYTIC[code](a, b)
     raise NotImplementedError(f"no Taylor series of CasADi's operation {code}")
