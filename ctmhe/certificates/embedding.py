@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 from scipy.linalg import qr
-from scipy.optimize import linprog
+from scipy.optimize import linprog, nnls
 from scipy.spatial import ConvexHull, QhullError
 
 from ctmhe.certificates.interval import Enclosure, Intervals
@@ -305,12 +305,13 @@ def _stretch(points: Array, left: Array) -> float:
     equal = np.vstack([np.hstack([inner.T, np.zeros((inner.shape[1], 1))]), [*np.ones(len(inner)), 0.0]])
     cost = np.append(np.zeros(len(inner)), -1.0)
     for k, rest in enumerate(left):
+        reached = np.inf
         for sign in (-1.0, 1.0):
             equal[k, -1] = sign
             best = linprog(cost, A_eq=equal, b_eq=[*np.zeros(len(left)), 1.0], bounds=(0, None), method="highs")
-            reached = min(reached, -best.fun) if sign > 0 else -best.fun
+            reached = min(reached, -best.fun) if best.status == 0 else 0.0
         equal[k, -1] = 0.0
-        stretch += 1.01 * rest / reached if reached > 1e-9 else np.inf  # the program is solved to 1e-7
+        stretch += 1.01 * rest / reached if reached > 1e-5 else np.inf  # the program is solved to 1e-7
         if stretch > STRETCH:
             break
     return stretch
@@ -323,14 +324,20 @@ def outermost(points: Array) -> np.ndarray:
         keep = np.array([points[:, 0].argmin(), points[:, 0].argmax()])
     elif 2 <= points.shape[1] <= 5 and len(points) > points.shape[1] + 1:
         with suppress(QhullError):
-            keep = np.sort(ConvexHull(points).vertices)
+            scaled = (points - points.mean(axis=0)) / np.maximum(np.ptp(points, axis=0), 1e-300)
+            hull = ConvexHull(scaled)
+            corners = np.vstack([scaled[hull.vertices].T, np.ones(len(hull.vertices))])
+            far = (hull.equations[:, :-1] @ scaled.T + hull.equations[:, -1:]).max(axis=0) > -1e-8
+            far[hull.vertices] = False  # near a facet: Qhull merges facets, and may have lost some
+            lost = [k for k in np.flatnonzero(far) if nnls(corners, np.append(scaled[k], 1.0))[1] > 1e-11]
+            keep = np.sort([*hull.vertices, *lost])
     return keep
 
 
 def _free(flat: Array) -> np.ndarray:
     """Return columns of samples in which the others are affine."""
-    upper, order = qr(flat - flat.mean(axis=0), mode="r", pivoting=True)
-    sizes = np.abs(np.diag(upper))
+    found: Any = qr(flat - flat.mean(axis=0), mode="r", pivoting=True)
+    sizes, order = np.abs(np.diag(found[0])), found[1]
     return np.sort(order[: int((sizes > 1e-10 * max(sizes[0], 1e-300)).sum())])
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -10,6 +12,7 @@ import numpy as np
 
 from ctmhe.certificates.embedding import (
     DEGREE,
+    MOST_SIDES,
     PIECES,
     bernstein,
     combined,
@@ -113,15 +116,16 @@ class Increments:
         blocks = [ca.jacobian(value, v)[:, self.place[key]] for value in values for key in "xwp"]
         self._shapes = [block.shape for block in blocks]
         ends = np.cumsum([0, *(block.numel() for block in blocks)])
-        self._columns = [slice(start, end) for start, end in zip(ends[:-1], ends[1:], strict=True)]
+        self._columns = [slice(start, end) for start, end in pairwise(ends)]
         stacked = ca.densify(ca.vertcat(*(ca.vec(block) for block in blocks)))
         self._at = ca.Function("jacobians", [v], [stacked])
         self.degrees: np.ndarray | None = None
         self.varying = np.arange(len(self.names))
         if self.symbolic:
-            degrees = degrees_of(stacked, v, self.nominal)
-            self.varying = np.flatnonzero(degrees)
             self._expression, self._rough = (blocks, v), is_rough(self._at)
+            degrees = degrees_of(stacked, v, self.nominal)
+            moves = [ca.depends_on(stacked, v[i]) for i in range(len(self.names))] if self._rough else degrees
+            self.varying = np.flatnonzero(moves)  # a derivative says nothing of a jump
             self.degrees = degrees if (degrees <= DEGREE).all() and not self._rough else None
         self._demand_bounds()
 
@@ -197,14 +201,27 @@ class Increments:
         v[:, self.varying] = np.where(sides, self.upper[self.varying], self.lower[self.varying])
         return v
 
-    def cover(self, which: str = "ABECDF") -> Cover:
+    def cover(self, which: str = "ABECDF", *, given: Mapping[str, Any] | None = None) -> Cover:
         """Return Jacobians whose hull holds those of the domain, in the named parts together; see `Cover`.
 
         A polynomial lies in the hull of its Bernstein coefficients; of one that is affine in every signal these are the
         values at the vertices. Signals of higher degree are cut into pieces first, which tightens the hull. What is no
         polynomial, or one in too many signals, is bounded as `embedding` explains. Parts that are not named are those
-        at some points of the domain.
+        at some point of the domain.
+
+        Parameters
+        ----------
+        given : mapping letter -> (lower, upper), optional
+            Bounds of the entries of one's own, for an FMU: matrices or scalars. All parts that are not constant at
+            samples must be there; the proof is as good as these bounds.
+
+        Raises
+        ------
+        InputError
+            If bounds are missing, of the wrong size, contradicted by a sample, or of more than 12 varying entries.
         """
+        if given is not None:
+            return self._given(which, given)
         if not len(self.varying):
             return Cover(self.at(self.centre), "constant", True)
         found = self._polynomial(which) or self._embedded(which) or self._grid(which)
@@ -238,12 +255,49 @@ class Increments:
         found = hull_points(of_interest, v, lower, upper, smooth=not self._rough)
         if found is None:
             return None
-        flat, start = np.repeat(self._flat(self.centre[None]), len(found), axis=0), 0
+        return Cover(_pruned(self._filled(which, found), which), "interval", True)
+
+    def _given(self, which: str, given: Mapping[str, Any]) -> Cover:
+        if unknown := set(given) - set(which):
+            raise InputError(f"cover: bounds of {sorted(unknown)}, but asked for the parts {which!r}")
+        points = np.vstack([self.random(GRID_POINTS, np.random.default_rng(0)), self.corners()])
+        samples, low, high = self.at(points), {}, {}
+        for letter in which:
+            part = getattr(samples, letter)
+            if letter not in given and not constant(part):
+                raise InputError(
+                    f"cover: {letter} varies over the domain: give its bounds too, ({letter!r}: (lower, upper))"
+                )
+            ends = given.get(letter, (part[0], part[0]))
+            try:
+                low[letter], high[letter] = (
+                    np.broadcast_to(np.asarray(end, dtype=float), part[0].shape) for end in ends
+                )
+            except ValueError:
+                raise InputError(f"cover: bounds of {letter} must be two of shape {part[0].shape} or scalar") from None
+            slack = 1e-9 * np.abs(part).max(initial=1e-300)
+            outside = (part < low[letter] - slack) | (part > high[letter] + slack)
+            if outside.any():
+                k, i, j = np.argwhere(outside)[0]
+                at = ", ".join(f"{name} = {value:.4g}" for name, value in zip(self.names, points[k], strict=True))
+                raise InputError(f"cover: {letter}[{i}, {j}] is {part[k, i, j]:.6g}, outside the given bounds, at {at}")
+        flat = [np.concatenate([side[letter].T.ravel() for letter in which]) for side in (low, high)]
+        moving = np.flatnonzero(flat[1] > flat[0])
+        if len(moving) > MOST_SIDES:
+            raise InputError(f"cover: {len(moving)} entries vary; the vertices of at most {MOST_SIDES} can be taken")
+        corners = np.tile(flat[0], (2 ** len(moving), 1))
+        sides = np.indices((2,) * len(moving)).reshape(len(moving), -1).T
+        corners[:, moving] = np.where(sides, flat[1][moving], flat[0][moving])
+        return Cover(self._filled(which, corners), "interval", True)
+
+    def _filled(self, which: str, values: Array) -> Jacobians:
+        """Return Jacobians with the named parts given, (k, entries of these), the others as at the centre."""
+        flat, start = np.repeat(self._flat(self.centre[None]), len(values), axis=0), 0
         for letter in which:
             place = self._columns["ABECDF".index(letter)]
-            flat[:, place] = found[:, start : start + place.stop - place.start]
+            flat[:, place] = values[:, start : start + place.stop - place.start]
             start += place.stop - place.start
-        return Cover(_pruned(self._parts(flat), which), "interval", True)
+        return self._parts(flat)
 
     def _grid(self, which: str) -> Cover:
         samples = self.random(GRID_POINTS, np.random.default_rng(0))
@@ -256,6 +310,9 @@ def _pruned(jacobians: Jacobians, which: str) -> Jacobians:
     count = len(jacobians.A)
     flat = np.concatenate([getattr(jacobians, letter).reshape(count, -1) for letter in which], axis=1)
     flat = np.round(flat / max(np.abs(flat).max(initial=0.0), 1e-300), 13)
+    flat = flat[:, np.ptp(flat, axis=0) > 0] if count > 1 else flat
+    if not flat.shape[1]:
+        return jacobians.take([0])
     first = np.sort(np.unique(flat, axis=0, return_index=True)[1])
     flat = flat[first] - flat[first].mean(axis=0)
     left, sizes, _ = np.linalg.svd(flat, full_matrices=False)

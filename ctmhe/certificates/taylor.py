@@ -45,13 +45,12 @@ def derivative_bounds(tape: Intervals, lower: Array, upper: Array, index: int, o
 
 
 def _applied(code: int, a: Series, b: Series) -> Series:
-    still = all(c is None for c in (*a[1:], *(b[1:] if code in BINARY else ())))
+    still = all(c is None for c in (*a[1:], *(b[1:] if code in BINARY else ())))  # a constant in this variable
     if code in LINEAR:
         return LINEAR[code](a, b)
     if still:
-        zero = a[0]
-        value = UNARY[code](*zero) if code in UNARY else BINARY[code](*zero, *b[0])
-        return [outward(value), *[None] * (len(a) - 1)]
+        bounds: Any = UNARY.get(code) or BINARY[code]
+        return [outward(bounds(*a[0]) if code in UNARY else bounds(*a[0], *b[0])), *[None] * (len(a) - 1)]
     if code in ANALYTIC:
         return ANALYTIC[code](a, b)
     raise NotImplementedError(f"no Taylor series of CasADi's operation {code}")
@@ -171,13 +170,13 @@ def _integral(code: int, slope: Any) -> Any:
 def _power(a: Series, exponent: float) -> Series:
     """Return a^r: whole powers by products, others by a g' = r a' g."""
     if exponent == round(exponent) and abs(exponent) <= 16:
-        made = _constant(1.0, a)
+        whole = _constant(1.0, a)
         for _n in range(int(abs(exponent)) // 2):
-            made = _product(made, _product(a, a))
-        made = _product(made, a) if int(abs(exponent)) % 2 else made
-        return _quotient(_constant(1.0, a), made) if exponent < 0 else made
+            whole = _product(whole, _product(a, a))
+        whole = _product(whole, a) if int(abs(exponent)) % 2 else whole
+        return _quotient(_constant(1.0, a), whole) if exponent < 0 else whole
     ends = (np.full_like(a[0][0], exponent),) * 2
-    made = [outward(BINARY[ca.OP_POW](*a[0], *ends))]
+    made: Series = [outward(BINARY[ca.OP_POW](*a[0], *ends))]
     for n in range(1, len(a)):
         terms = (_scaled(_times(a[i], made[n - i]), (exponent * i - (n - i)) / n) for i in range(1, n + 1))
         made.append(_over(_sum(terms), a[0]))

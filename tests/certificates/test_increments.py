@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from ctmhe.certificates.increments import Increments
 from ctmhe.errors import InputError
 from ctmhe.models import ContinuousModel
-from ctmhe.models.library import chua, chua_discrete, cstr, quadrotor, van_der_pol
+from ctmhe.models.library import chua, chua_discrete, quadrotor, van_der_pol
 from ctmhe.types import Bounds
 from tests.certificates.trajectories import decay, mixer
 
@@ -68,8 +68,8 @@ def test_no_point_lies_outside_a_rigorous_hull(name, which, seed):
     assert (inside @ direction).max() <= (hull @ direction).max() + 1e-9
 
 
-def test_the_method_is_named_and_a_grid_is_no_proof():
-    """Constant, multi-affine, polynomial; anything else is sampled and says so; kinks are not trusted."""
+def test_the_method_is_named_and_every_one_is_a_proof():
+    """Constant, multi-affine, polynomial; anything else is bounded, kinks too."""
     linear = one("linear", lambda t, x, u, w, p: (x[1], -x[0] + p[0]))
     bilinear = one("bilinear", lambda t, x, u, w, p: (x[1], -p[0] * x[0]), x=(-1, 1), p=(1, 2))
     cubic = one("cubic", lambda t, x, u, w, p: (x[1], -p[0] * x[0] ** 3), x=(-1, 1), p=(1, 2))
@@ -78,7 +78,7 @@ def test_the_method_is_named_and_a_grid_is_no_proof():
     said = {m.name: (Increments(m).cover().method, Increments(m).cover().rigorous) for m in (linear, bilinear, cubic)}
     assert said == {"linear": ("constant", True), "bilinear": ("vertices", True), "cubic": ("bernstein", True)}
     for model in (sine, kink):
-        assert (Increments(model).cover().method, Increments(model).cover().rigorous) == ("grid", False)
+        assert (Increments(model).cover().method, Increments(model).cover().rigorous) == ("interval", True)
 
 
 def test_only_signals_that_matter_need_bounds():
@@ -102,17 +102,11 @@ def test_time_is_refused_with_a_remedy():
         Increments(one("clock", lambda t, x, u, w, p: (ca.sin(t) * x[1], -x[0]), x=(-1, 1)))
 
 
-def test_exponential_rates_are_sampled():
-    """The stirred tank reactor: Arrhenius terms are no polynomials."""
-    model = cstr(parameters=("k0",))
-    assert not Increments(model, Bounds(x=(0.5, 350.0), p=(7e10, 7.4e10)), u=(0.05, 320.0)).cover().rigorous
-
-
 def test_a_grid_has_points_all_over():
     """Entries that are constant but for rounding do not hide those that vary: the quadrotor's angles turn A."""
     angles, rates = dict.fromkeys(("phi", "theta", "psi"), (-0.5, 0.5)), dict.fromkeys(("O1", "O2", "O3"), (-1, 1))
     increments = Increments(quadrotor(), Bounds(x=angles | rates), u=(500, 900))
-    cover = increments.cover("ABCD")
-    assert cover.method == "grid" and len(cover.jacobians.A) > 20
+    cover = increments._grid("ABCD")
+    assert not cover.rigorous and len(cover.jacobians.A) > 20
     there = increments.at(increments.random(50, np.random.default_rng(0))).A
     assert np.ptp(cover.jacobians.A, axis=0).max() > 0.8 * np.ptp(there, axis=0).max()
