@@ -1,6 +1,7 @@
 """ctmhe: continuous-time, event-triggered moving horizon estimation with FMU support."""
 
 from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
 
 from ctmhe.data import MeasurementLog
 from ctmhe.errors import CtmheError, FmuError, InputError, MissingExtra, ModelError, NotEstimated, TooLate, TriggerError
@@ -56,6 +57,9 @@ from ctmhe.triggers import (
 )
 from ctmhe.types import Bounds, DiscountedCost, Estimate, Input, Measurement, Outcome, Status, Trajectory
 
+if TYPE_CHECKING:
+    from ctmhe.certificates import DetectabilityCertificate, certify_detectability
+
 try:
     __version__ = version("ctmhe")
 except PackageNotFoundError:  # running from a source tree that is not installed
@@ -72,6 +76,7 @@ __all__ = [
     "CovarianceSelfTriggered",
     "CtmheError",
     "Deadband",
+    "DetectabilityCertificate",
     "DiscountedCost",
     "DiscreteModel",
     "During",
@@ -126,6 +131,7 @@ __all__ = [
     "TriggerError",
     "Uniform",
     "WholeSignal",
+    "certify_detectability",
     "check_fmu",
     "explore",
     "find_threshold",
@@ -136,3 +142,12 @@ __all__ = [
     "sobol",
     "trigger",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Return what few programs need, imported when asked for."""
+    if name not in ("DetectabilityCertificate", "certify_detectability"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from ctmhe import certificates
+
+    return getattr(certificates, name)
