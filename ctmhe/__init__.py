@@ -1,6 +1,7 @@
 """ctmhe: continuous-time, event-triggered moving horizon estimation with FMU support."""
 
 from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
 
 from ctmhe.certificates.guarantee import Guarantee
 from ctmhe.data import MeasurementLog
@@ -59,6 +60,9 @@ from ctmhe.triggers import (
 )
 from ctmhe.types import Bounds, DiscountedCost, Estimate, Input, Measurement, Outcome, Status, Trajectory
 
+if TYPE_CHECKING:
+    from ctmhe.certificates import DetectabilityCertificate, certify_detectability
+
 try:
     __version__ = version("ctmhe")
 except PackageNotFoundError:  # running from a source tree that is not installed
@@ -77,6 +81,7 @@ __all__ = [
     "CovarianceSelfTriggered",
     "CtmheError",
     "Deadband",
+    "DetectabilityCertificate",
     "DiscountedCost",
     "DiscreteModel",
     "During",
@@ -132,6 +137,7 @@ __all__ = [
     "TriggerError",
     "Uniform",
     "WholeSignal",
+    "certify_detectability",
     "check_fmu",
     "explore",
     "find_threshold",
@@ -142,3 +148,12 @@ __all__ = [
     "sobol",
     "trigger",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Return what few programs need, imported when asked for."""
+    if name not in ("DetectabilityCertificate", "certify_detectability"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from ctmhe import certificates
+
+    return getattr(certificates, name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,7 +24,7 @@ SLACKS = (1e-7, 1e-6, 1e-5, 1e-4)
 FRESH, FIRST, ROUNDS = 2000, 8, 25
 MANY, HASTE = 64, 1.25
 """From how many Jacobians on the program is asked for how much more of -ln eta: few of them then suffice."""
-ROUNDING = 1e-12
+ROUNDING = 1e-14
 """Of the largest entry: an eigenvalue that is not below its negative is taken for zero."""
 
 
@@ -64,9 +65,9 @@ def certify_detectability(
         `conditioning`: least condition number of P, in nominal units. `horizon`: shortest horizon
         (3.30); a given P bounds U from above, and the function below it is found; without P the same as `rate`.
     jacobians : mapping letter -> (lower, upper), or Cover, optional
-        Bounds of the entries of A, B, C and D (7.32), matrices or scalars, what does not vary left out: for an FMU, whose
-        derivatives can be sampled only. Or Jacobians whose hull holds those of the domain. The certificate is as
-        rigorous as they are.
+        Bounds of the entries of A, B, C and D (7.32), matrices or scalars, what does not vary left out: for an FMU,
+        whose derivatives can be sampled only. Or Jacobians whose hull holds those of the domain. The certificate is
+        as rigorous as they are.
     seed : int
         Of the fresh points.
 

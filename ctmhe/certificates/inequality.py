@@ -58,8 +58,7 @@ class Sizes:
     @property
     def scale(self) -> Array:
         """Of (x, d)."""
-        scale: Array = block_diag(self.units.x, *(getattr(self.units, group) for group in self.groups))
-        return scale
+        return np.asarray(block_diag(self.units.x, *(getattr(self.units, group) for group in self.groups)))
 
     def stacked(self, jacobians: Jacobians) -> tuple[Array, Array]:
         """Return f (k, nx, nx + nd) and h (k, ny, nx + nd)."""

@@ -39,7 +39,8 @@ def certify_file(path: Path) -> Certified:
     path : Path
         TOML: [model] with `model` and `options` of the library, or `fmu` and what `FmuModel` takes; [domain] with boxes
         x, u, w, p, a pair or a table of pairs, the model's own when left out; [certificate] with arguments of
-        `certify_detectability`, and `horizon` and `wait` in seconds, for the report.
+        `certify_detectability`, and `horizon` and `wait` for the report, in
+        seconds, or steps of a discrete model.
 
     Raises
     ------
@@ -70,7 +71,7 @@ def report(found: Certified) -> str:
     """Return the certificate as text: what, where, how rigorous, horizon, rate, longest wait."""
     model, made = found.model, found.certificate
     unit = "steps" if model.step else "s"
-    per = "step" if model.step else "second"
+    per = f"step of {model.step:g} s" if model.step else "second"
     wait = found.wait or 0.0
     rows = [
         f"{model.name}: detectable, with a quadratic i-{'' if model.step else 'i'}IOSS Lyapunov function",
@@ -78,7 +79,7 @@ def report(found: Certified) -> str:
         f"rate      eta = {made.eta:.6g} per {per}: U fades by half in {np.log(2) / -np.log(made.eta):.4g} {unit}",
         f"proof     {'yes' if made.rigorous else 'no, evidence only'}; domain covered by: {made.method}",
         f"margin    {made.margin:.3g} at fresh points, the least at {_point(made)}",
-        f"horizon   longer than {made.shortest_horizon(wait=wait):.5g} {unit}, with samples at most {wait:g} {unit} apart",
+        f"horizon   longer than {made.shortest_horizon(wait=wait):.5g} {unit}, samples at most {wait:g} {unit} apart",
     ]
     if found.horizon is not None:
         rows.append(

@@ -48,7 +48,9 @@ RESULTS = {"Predicate", "Watch", "WatchState", "TriggerContext", "Outlook", "Exc
 """What these rooms hand out, not what a user writes."""
 
 
-@pytest.mark.parametrize("room", ["ctmhe.triggers", "ctmhe.studies", "ctmhe.plotting", "ctmhe.models.library"])
+@pytest.mark.parametrize(
+    "room", ["ctmhe.triggers", "ctmhe.studies", "ctmhe.plotting", "ctmhe.models.library", "ctmhe.certificates"]
+)
 def test_each_public_name_is_in_an_executed_example(room):
     """A name that no page and no notebook shows is not documented."""
     shown = [block for page in PAGES for block in BLOCK.findall(page.read_text("utf-8"))]
