@@ -157,8 +157,8 @@ for note in flying.notes:
 # %% [markdown]
 # A domain that the plant can leave is no obstacle to the certificate, which speaks of trajectories while they stay
 # inside; that they do is ours to see to. Here small inputs sway the machine for three seconds. Disturbances are within
-# 1e-3 and noise within 0.01; holding a record for 0.01 s adds the speed, up to 1.5 m/s, times that. The initial error is
-# known up to its sign: `error=`.
+# 1e-3 and noise within 0.01; holding a record for 0.01 s adds the speed, up to 1.5 m/s, times that. The initial error
+# is known up to its sign: `error=`.
 
 # %%
 wrong = np.array([0.3, -0.3, 0.2, 0.05, -0.05, 0.05, 0.3, 0.3, -0.2, 0.05, 0.05, 0.05])

@@ -121,8 +121,7 @@ def certify_detectability(
 def _cover(increments: Increments, jacobians: Cover | Mapping[str, Any] | None) -> Cover:
     if isinstance(jacobians, Cover):
         return jacobians
-    # MERGE: `given` comes with the covers of `Increments`
-    return increments.cover("ABCD", **({} if jacobians is None else {"given": jacobians}))
+    return increments.cover("ABCD", given=jacobians)
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ from scipy.linalg import eigh
 from scipy.optimize import minimize_scalar
 
 from ctmhe.certificates.excited_set import Drift, ExcitationDesign
-from ctmhe.certificates.increments import Cover, Increments, Jacobians, constant
+from ctmhe.certificates.increments import AT_ONCE, Cover, Increments, Jacobians, constant
 from ctmhe.certificates.injection import SLACKS, SPEEDS, Units, design, gathered, least_upper_bound, phi_factor
 from ctmhe.errors import CertificateError, InputError
 from ctmhe.models.continuous import Model
@@ -147,7 +147,7 @@ def design_excitation(
 
 
 def _cover(increments: Increments) -> tuple[Cover, tuple[str, ...]]:
-    cover = increments.cover("ABCD")
+    cover = increments.cover("ABCD", most=AT_ONCE)
     if constant(cover.jacobians.C) and constant(cover.jacobians.D):
         return cover, ()
     pairs = increments.between(*increments.random_pairs(100, np.random.default_rng(3)))

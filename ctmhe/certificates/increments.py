@@ -29,6 +29,9 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 NODES, WEIGHTS = (NODES + 1) / 2, WEIGHTS / 2  # exact for Jacobians of degree 15 and less
 MOST_POINTS, GRID_POINTS, KEPT = 20_000, 400, 40
 
+AT_ONCE = 80
+"""Jacobians that a program takes which has to see all of them at once; domains that need more are sampled for it."""
+
 
 class Jacobians(NamedTuple):
     """Derivatives (7.39) at k points, of f by x, w, p and of h by x, w, p, in the model's units.
@@ -201,7 +204,7 @@ class Increments:
         v[:, self.varying] = np.where(sides, self.upper[self.varying], self.lower[self.varying])
         return v
 
-    def cover(self, which: str = "ABECDF", *, given: Mapping[str, Any] | None = None) -> Cover:
+    def cover(self, which: str = "ABECDF", *, given: Mapping[str, Any] | None = None, most: int | None = None) -> Cover:
         """Return Jacobians whose hull holds those of the domain, in the named parts together; see `Cover`.
 
         A polynomial lies in the hull of its Bernstein coefficients; of one that is affine in every signal these are the
@@ -214,6 +217,8 @@ class Increments:
         given : mapping letter -> (lower, upper), optional
             Bounds of the entries of one's own, for an FMU: matrices or scalars. All parts that are not constant at
             samples must be there; the proof is as good as these bounds.
+        most : int, optional
+            For programs that have to see all of them at once: where more would be needed, a grid takes their place.
 
         Raises
         ------
@@ -225,6 +230,8 @@ class Increments:
         if not len(self.varying):
             return Cover(self.at(self.centre), "constant", True)
         found = self._polynomial(which) or self._embedded(which) or self._grid(which)
+        if most is not None and len(found.jacobians.A) > most:
+            return self._grid(which)
         return replace(found, method="constant") if len(found.jacobians.A) == 1 and found.rigorous else found
 
     def _polynomial(self, which: str) -> Cover | None:

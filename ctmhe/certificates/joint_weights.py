@@ -9,7 +9,7 @@ import numpy as np
 from scipy.linalg import block_diag, eigh
 
 from ctmhe.certificates.excited_set import ExcitedSet
-from ctmhe.certificates.increments import Increments, Jacobians, constant
+from ctmhe.certificates.increments import AT_ONCE, Increments, Jacobians, constant
 from ctmhe.certificates.injection import Units, coordinates
 from ctmhe.certificates.lmi import require_cvxpy, solved
 from ctmhe.errors import CertificateError, InputError
@@ -75,7 +75,7 @@ def detect_states(model: Model, domain: Bounds | None = None, *, eta: float, u: 
         raise InputError(f"detect_states: eta must lie in (0, 1), a factor per step or second, got {eta}")
     cp = require_cvxpy()
     increments, units = Increments(model, domain, u=u), Units.of(model)
-    cover, centre = increments.cover(), increments.at(increments.centre)
+    cover, centre = increments.cover(most=AT_ONCE), increments.at(increments.centre)
     parts, method, rigorous = cover.jacobians, cover.method, cover.rigorous
     if not all(constant(part) for part in parts[3:]):
         pairs = increments.mean(*increments.random_pairs(100, np.random.default_rng(3)))

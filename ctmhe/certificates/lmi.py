@@ -25,17 +25,20 @@ def solved(problem: Any) -> float:
     CertificateError
         If it is infeasible or unbounded, or the solver fails.
     """
-    cp = require_cvxpy()
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of inaccurate solutions: every matrix is verified again
-            # cut up along their sparsity, matrices of the small programs here lose their interior
-            value = problem.solve(solver=cp.CLARABEL, chordal_decomposition_enable=False)
-    except cp.SolverError:
+    cp, value = require_cvxpy(), None
+    for cut in (False, True):  # along their sparsity: most matrices here lose their interior by it, a few need it
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of inaccurate solutions: every matrix is verified again
+                value = problem.solve(solver=cp.CLARABEL, chordal_decomposition_enable=cut)
+            break
+        except cp.SolverError:
+            continue
+    if value is None:
         raise CertificateError(
             "the semidefinite program could not be solved: it is infeasible or badly scaled. Try a slower rate, a "
             "smaller domain, or nominal= nearer to the sizes of the signals"
-        ) from None
+        )
     if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
         raise CertificateError(f"the matrix inequality is {problem.status}; try a slower rate, or a smaller domain")
     return float(value)

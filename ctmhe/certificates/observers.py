@@ -26,7 +26,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from ctmhe.certificates.certificate import largest_ratio
-from ctmhe.certificates.increments import Increments, Jacobians
+from ctmhe.certificates.increments import AT_ONCE, Increments, Jacobians
 from ctmhe.certificates.injection import Units, coordinates
 from ctmhe.certificates.lmi import require_cvxpy, solved
 from ctmhe.errors import CertificateError, InputError
@@ -203,7 +203,7 @@ def design_observer(model: Model, domain: Bounds | None = None, *, eta: float, u
     low, high = box_arrays(model.w, domain.w, "domain of w")
     hull = replace(domain, w=(np.minimum(low, 0.0), np.maximum(high, 0.0)))  # the observer takes w = 0
     increments, units = Increments(model, hull, u=u), Units.of(model)
-    cover = increments.cover("ABCD")
+    cover = increments.cover("ABCD", most=AT_ONCE)
     process, noise = split_disturbances(cover.jacobians)
     places = {"process": process, "noise": noise}
     basis = coordinates(units, cover.jacobians, increments.at(increments.centre), eta)

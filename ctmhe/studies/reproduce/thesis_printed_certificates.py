@@ -14,7 +14,7 @@ from ctmhe.certificates.lmi import require_cvxpy, solved
 from ctmhe.models import DiscreteModel
 from ctmhe.models.continuous import Model
 from ctmhe.models.library import batch_reactor
-from ctmhe.studies.reproduce import printed_joint, thesis_3_4_1_ct
+from ctmhe.studies.reproduce import printed_joint, printed_observers, thesis_3_4_1_ct
 from ctmhe.types import Array, Bounds
 
 P = np.array([[4.539, 4.171], [4.171, 3.834]])
@@ -110,7 +110,7 @@ def reproduce(*, seeds: int = 1, workers: int = 1, progress: bool = False) -> di
     }
     for name, job in tqdm(jobs.items(), desc="sections", disable=None if progress else True):
         rows[name] = job()
-    # MERGE: rows |= printed_observers.rows() adds "thesis 4.2.6" and "thesis 4.3.3"
+    rows |= printed_observers.rows()
     comments += [f"{name}: {found['comment']}" for name, found in rows.items() if "comment" in found]
     return {
         "case": "thesis-printed-certificates",
