@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Run the tests in .venv: fast ones first, then slow ones, then the notebooks. Stops at the first group that fails.
+# Run the tests in .venv, two at a time: fast ones first, then slow ones, then the notebooks. Stops at the first group
+# that fails.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 pytest=(.venv/bin/python -m pytest)
@@ -11,8 +12,8 @@ group() {
   [ $code -eq 0 ] || [ $code -eq 5 ] || exit $code
 }
 
-"${pytest[@]}" -m 'not slow' --durations=5
-group "${pytest[@]}" -m slow --durations=5
+"${pytest[@]}" -n 2 -m 'not slow' --durations=5
+group "${pytest[@]}" -n 2 -m slow --durations=5
 
 shopt -s nullglob
 notebooks=(notebooks/*.ipynb)

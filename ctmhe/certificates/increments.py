@@ -100,6 +100,7 @@ class Increments:
 
     def __init__(self, model: Model, domain: Bounds | None = None, *, u: Any = None):
         self.model, domain = model, domain or model.bounds
+        self._boxes = domain, u
         groups = {"x": domain.x, "u": u, "w": domain.w, "p": domain.p}
         boxes = [box_arrays(getattr(model, key), box, f"domain of {key}") for key, box in groups.items()]
         self.lower, self.upper = (np.concatenate([box[side] for box in boxes]) for side in (0, 1))
@@ -131,6 +132,9 @@ class Increments:
             self.varying = np.flatnonzero(moves)  # a derivative says nothing of a jump
             self.degrees = degrees if (degrees <= DEGREE).all() and not self._rough else None
         self._demand_bounds()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _rebuilt, (self.model, *self._boxes)  # expressions cannot be pickled
 
     def _demand_bounds(self) -> None:
         free = [i for i in self.varying if not np.isfinite([self.lower[i], self.upper[i]]).all()]
@@ -341,3 +345,7 @@ def _farthest(jacobians: Jacobians, which: str) -> Jacobians:
 def constant(parts: Array) -> bool:
     """Return whether k matrices are the same, to rounding."""
     return bool(np.ptp(parts, axis=0).max(initial=0.0) <= 1e-11 * np.abs(parts).max(initial=1.0))
+
+
+def _rebuilt(model: Model, domain: Bounds, u: Any) -> Increments:
+    return Increments(model, domain, u=u)
