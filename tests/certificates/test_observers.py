@@ -151,7 +151,7 @@ def test_an_infeasible_rate_names_itself_and_a_remedy():
 
 
 def test_a_pendulum_is_covered_by_intervals():
-    """Sines: a proof, and the law at random points; a range of w without zero is extended to it, where the observer is."""
+    """Sines: a proof, and the law at random points; a range of w without zero is extended to it."""
     pendulum = ContinuousModel(
         lambda t, x, u, w, p: [x[1], -ca.sin(x[0]) - 0.1 * x[1] + w[0]],
         lambda t, x, u, w, p: x[0] + 0.1 * ca.sin(w[1]),
