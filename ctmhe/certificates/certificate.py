@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -84,7 +85,7 @@ class DetectabilityCertificate:
             )
         object.__setattr__(self, "worst", MappingProxyType(dict(self.worst or {})))
 
-    @property
+    @cached_property
     def ratio(self) -> float:
         """lambda_max(P_upper, P_lower): 1 where U is a quadratic form."""
         return max(largest_ratio(self.P_upper, self.P_lower), 1.0)

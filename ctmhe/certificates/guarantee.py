@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 from typing import Any
 
@@ -100,7 +101,7 @@ class WindowBounds:
         """Seconds per unit of time in which eta counts."""
         return self.certificate.step or 1.0
 
-    @property
+    @cached_property
     def limit(self) -> float:
         """Seconds that the wait for a sample must stay below (3.29)."""
         return self.certificate.longest_wait(self.horizon / self.unit) * self.unit

@@ -55,6 +55,15 @@ class Guaranteed:
             slack=1e-6 * mhe.interval,
         )
 
+    def outside(self, p: Array) -> tuple[str, ...]:
+        """Return in words which known parameters (np,) lie outside the certificate's domain."""
+        domain = self.guarantee.certificate.domain
+        lower, upper = box_arrays(self.model.p, domain.p if domain else None, "domain of p")
+        out = [
+            name for name, value, a, b in zip(self.model.p.names, p, lower, upper, strict=True) if not a <= value <= b
+        ]
+        return tuple(f"parameter {name} lies outside the certificate's domain" for name in out)
+
     def begin(self, t: float, x: Array) -> Track:
         """Return the track at the start: how wrong the initial estimate `x` (nx,) can be."""
         lower, upper = self.domain

@@ -280,8 +280,12 @@ class MHE:
         if len(model.u) and u_start is not None:
             inputs = inputs.put(t, frozen(u_start))
         start = frozen(np.concatenate([x0, p0]))
-        track = None if self.guaranteed is None else self.guaranteed.begin(t, x0)
-        return State(t, t, start, x0, p0, Log(len(model.y)), inputs, empty_path(self.stage), t, track=track)
+        state = State(t, t, start, x0, p0, Log(len(model.y)), inputs, empty_path(self.stage), t)
+        if self.guaranteed is not None:
+            state = made(State, state.__dict__ | {"track": self.guaranteed.begin(t, x0)})
+            for reason in self.guaranteed.outside(p0):
+                state = self.doubt(state, np.inf, reason)
+        return state
 
     def doubt(self, state: State, t: float, reason: str) -> State:
         """Return the state that knows that its data at `t` are not what a guarantee assumes, such as a lost message.
@@ -752,6 +756,16 @@ class MHE:
                 f"trajectory at t = {t:g} s: kept is the horizon before the last estimate at {state.t:g} s"
             )
         return frozen(value[: self.stage.nx])
+
+    def trajectory_bound(self, state: State, t: float) -> float | None:
+        """Return the guaranteed bound of |x_hat(t) - x(t)|_P_lower along the estimated trajectory (3.20), if any.
+
+        For times within the last horizon, as `trajectory`.
+        """
+        if self.guaranteed is None or state.track is None or self.guaranteed.unmet:
+            return None
+        level = self.guaranteed.bounds.at(state.track, finite_time(t, "trajectory_bound"))
+        return float(np.sqrt(level)) if np.isfinite(level) else None
 
     def reference(self, state: State, t: float) -> Estimate:
         """Solve the window that ends at `t` by IPOPT, for checking; the state is not advanced."""

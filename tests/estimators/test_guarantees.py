@@ -55,6 +55,37 @@ def test_the_error_stays_below_its_bounds(seed, every, level):
         assert bound.level <= bound.theorem
 
 
+def test_the_trajectory_has_bounds_too():
+    """At a solve that of the estimate, and larger before it on its piece; none for an estimator without guarantee."""
+    mhe = reactor()
+    state, found = observed(mhe, until=2.5)
+    last = found[-1][0]
+    assert mhe.trajectory_bound(state, last.t) == pytest.approx(np.sqrt(last.bound.level))
+    assert mhe.trajectory_bound(state, last.t - 0.05) > mhe.trajectory_bound(state, last.t)
+    assert reactor(guarantee=None).trajectory_bound(state, last.t) is None
+
+
+def test_known_parameters_must_lie_in_the_domain():
+    """A rate constant beyond the certificate's box costs the bound, by name."""
+    model = batch_reactor(parameters="k1")
+    domain = replace(MODEL.bounds, p={"k1": (0.1, 0.2)})
+    certificate = replace(CERTIFICATE, domain=domain)
+    mhe = MHE(
+        model,
+        horizon=2.0,
+        interval=0.05,
+        integrator=RK4(0.05),
+        cost=COST,
+        bounds=MODEL.bounds,
+        hold="zero",
+        guarantee=Guarantee(certificate, 0.1),
+    )
+    for k1, known in ((0.16, True), (0.3, False)):
+        state = mhe.observe(mhe.init(x=[0.1, 4.5], p=[k1]), Measurement(0.0, [4.0]))
+        bound = mhe.estimate(state, 0.1)[1].bound
+        assert (bound.size is not None) == known and ("k1" in str(bound)) != known
+
+
 def test_the_bound_gets_below_the_domains_width():
     """It starts with the domain, and tells more after a horizon."""
     _, found = observed(reactor(level=1e-3))

@@ -245,9 +245,7 @@ def reproduce(*, seeds: int = 7, workers: int = 1, progress: bool = False, trial
             raise MissingExtra("joblib", "study", "reproducing a case on several workers") from None
 
         found = list(
-            Parallel(workers)(
-                delayed(one_plant)(plant, seeds, trials=trials, progress=progress) for plant in PLANTS
-            )
+            Parallel(workers)(delayed(one_plant)(plant, seeds, trials=trials, progress=progress) for plant in PLANTS)
         )
     ours: dict[str, Any] = {plant.name: numbers for plant, numbers in zip(PLANTS, found, strict=True)}
     largest = {
