@@ -24,6 +24,7 @@ _PLACES = {
         "search_jointly",
         "uniform_excitation",
     ),
+    "metric": ("certify_metric",),
     "joint_horizons": ("joint_conditions", "joint_horizon"),
     "joint_weights": ("JointWeights", "StateDetectability", "detect_states", "joint_weights", "unmet"),
     "observers": ("design_observer",),
