@@ -44,8 +44,8 @@ def test_relative_links_of_a_page_lead_to_files(page):
 
 
 RESULTS = {"Predicate", "Watch", "WatchState", "TriggerContext", "Outlook", "ExcitationMeasure", "Or", "Design",
-           "Exploration", "Status", "StudyResult", "Threshold", "Direction", "Information", "ExcitationDesign", "Growth",
-           "JointBound", "JointCertificate", "JointWeights", "OnlineConditions"}  # fmt: skip
+           "Exploration", "Status", "StudyResult", "Threshold", "Direction", "Information", "ExcitationDesign",
+           "Growth", "JointBound", "JointCertificate", "JointWeights", "OnlineConditions"}  # fmt: skip
 """What these rooms hand out, not what a user writes."""
 
 
