@@ -26,9 +26,9 @@ _PLACES = {
     ),
     "metric": ("certify_metric",),
     "joint_horizons": ("joint_conditions", "joint_horizon"),
-    "joint_weights": ("JointWeights", "StateDetectability", "detect_states", "joint_weights", "unmet"),
     "observers": ("design_observer",),
     "suboptimal_horizons": ("observer_horizon", "trajectory_horizon"),
+    "weights": ("JointWeights", "StateDetectability", "detect_states", "joint_weights", "unmet"),
 }
 _MODULES = {name: module for module, names in _PLACES.items() for name in names}
 

@@ -13,7 +13,7 @@ from ctmhe.certificates.excitation import ExcitationMonitor
 from ctmhe.certificates.excitation_design import best_factor, design_excitation, filter_bounds
 from ctmhe.certificates.excited_set import ExcitationDesign, ExcitedSet
 from ctmhe.certificates.injection import Units, least_upper_bound
-from ctmhe.certificates.joint_weights import StateDetectability
+from ctmhe.certificates.weights import StateDetectability
 from ctmhe.errors import CertificateError, InputError
 from ctmhe.models.continuous import Model
 from ctmhe.types import Array, Bounds, DiscountedCost, Trajectory, frozen, positive

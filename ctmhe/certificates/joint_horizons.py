@@ -9,7 +9,7 @@ import numpy as np
 
 from ctmhe.certificates.certificate import largest_ratio
 from ctmhe.certificates.excited_set import ExcitedSet
-from ctmhe.certificates.joint_weights import JointWeights, StateDetectability, unmet
+from ctmhe.certificates.weights import JointWeights, StateDetectability, unmet
 from ctmhe.errors import CertificateError, InputError
 
 LONGEST = 2**22

@@ -12,7 +12,6 @@ from ctmhe.certificates.comparison import compare_horizons
 from ctmhe.certificates.excited_set import ExcitedSet
 from ctmhe.certificates.horizon import aligned, contraction, longest_wait, shortest_horizon, smallest_horizon
 from ctmhe.certificates.joint_horizons import joint_conditions, joint_horizon
-from ctmhe.certificates.joint_weights import StateDetectability, joint_weights
 from ctmhe.certificates.observers import ObserverFunction
 from ctmhe.certificates.suboptimal_horizons import (
     Lipschitz,
@@ -22,6 +21,7 @@ from ctmhe.certificates.suboptimal_horizons import (
     observer_horizon,
     trajectory_horizon,
 )
+from ctmhe.certificates.weights import StateDetectability, joint_weights
 from ctmhe.errors import InputError
 from ctmhe.models.library import batch_reactor, three_species_discrete
 from ctmhe.types import Bounds

@@ -26,7 +26,7 @@ from ctmhe.certificates.joint import (
     uniform_excitation,
     young_weights,
 )
-from ctmhe.certificates.joint_weights import (
+from ctmhe.certificates.weights import (
     StateDetectability,
     detect_states,
     detectability_margin,

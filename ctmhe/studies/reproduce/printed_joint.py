@@ -10,8 +10,8 @@ from scipy.linalg import eigh
 from ctmhe.certificates.excitation_design import design_excitation
 from ctmhe.certificates.increments import Increments
 from ctmhe.certificates.injection import Units
-from ctmhe.certificates.joint_weights import detect_states, detectability_margin
 from ctmhe.certificates.lmi import require_cvxpy, solved
+from ctmhe.certificates.weights import detect_states, detectability_margin
 from ctmhe.errors import CertificateError
 from ctmhe.models.library import chua_discrete
 from ctmhe.types import Array

@@ -11,9 +11,9 @@ import numpy as np
 from ctmhe.certificates.certificate import DetectabilityCertificate
 from ctmhe.certificates.increments import Increments, Jacobians
 from ctmhe.certificates.injection import Units
-from ctmhe.certificates.joint_weights import detectability_margin
 from ctmhe.certificates.lmi import require_cvxpy, solved
 from ctmhe.certificates.observers import ObserverFunction, design_observer, observer_margin, split_disturbances
+from ctmhe.certificates.weights import detectability_margin
 from ctmhe.models.discrete import DiscreteModel
 from ctmhe.models.library import batch_reactor, three_species_discrete
 from ctmhe.types import Array, Bounds

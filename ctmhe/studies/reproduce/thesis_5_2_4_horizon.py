@@ -9,7 +9,7 @@ import numpy as np
 
 from ctmhe.certificates.excited_set import ExcitedSet
 from ctmhe.certificates.joint_horizons import joint_conditions, joint_horizon
-from ctmhe.certificates.joint_weights import JointWeights, StateDetectability, joint_weights
+from ctmhe.certificates.weights import JointWeights, StateDetectability, joint_weights
 from ctmhe.studies.reproduce import printed_joint as printed
 from ctmhe.types import Array, frozen
 
