@@ -72,8 +72,8 @@ def _scaled(x: Pair | None, factor: float) -> Pair | None:
     """Return `factor` times an interval; thirds and the like are not exact, hence the widening."""
     if x is None or factor == 0:
         return None
-    ends = x[0] * factor, x[1] * factor
-    return outward(outward(ends if factor > 0 else ends[::-1]))
+    low, high = x if factor > 0 else (x[1], x[0])
+    return outward(outward((low * factor, high * factor)))
 
 
 def _sum(terms: Any) -> Pair | None:

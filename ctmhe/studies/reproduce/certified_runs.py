@@ -237,7 +237,7 @@ def reproduce(*, seeds: int = 7, workers: int = 1, progress: bool = False, trial
     dict with `published`, `ours` (by plant), `settings`, `comment`
     """
     if workers == 1:
-        found = [one_plant(plant, seeds, trials=trials, progress=progress) for plant in PLANTS]
+        found: list[Any] = [one_plant(plant, seeds, trials=trials, progress=progress) for plant in PLANTS]
     else:
         try:
             from joblib import Parallel, delayed
