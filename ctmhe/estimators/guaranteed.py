@@ -64,6 +64,15 @@ class Guaranteed:
         ]
         return tuple(f"parameter {name} lies outside the certificate's domain" for name in out)
 
+    def incomplete(self, times: Array, rows: Array, start: float) -> Doubts:
+        """Return a doubt for the last record from `start` on in which an output has no value."""
+        gaps = np.flatnonzero(np.isnan(rows).any(axis=1) & (times >= start - self.bounds.slack))
+        if not len(gaps):
+            return ()
+        k = int(gaps[-1])
+        names = [name for name, value in zip(self.model.y.names, rows[k], strict=True) if np.isnan(value)]
+        return ((np.inf, f"no value of {', '.join(names)} at t = {times[k]:g} s"),)
+
     def begin(self, t: float, x: Array) -> Track:
         """Return the track at the start: how wrong the initial estimate `x` (nx,) can be."""
         lower, upper = self.domain

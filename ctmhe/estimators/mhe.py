@@ -321,7 +321,7 @@ class MHE:
             row = self.model.y.vector(row, f"measurement at t = {t:g}", missing=np.nan, allow_nan=True)
         self._check_age(state, t, "measurement")
         if not complete and not np.isfinite(row).any():
-            return state
+            return state if self.guaranteed is None else self.doubt(state, t, f"no output has a value at t = {t:g} s")
         self._check_step(t, "measurement")
         known = state.measurements.find(t)
         if known is not None:
@@ -570,7 +570,9 @@ class MHE:
         if self.guaranteed is not None:
             first = float(solved.part("t")[0])
             track = state.track or self.guaranteed.begin(state.t0, state.start[: self.stage.nx])
-            fields["track"], bound = self.guaranteed.after(track, first, t, cost, status, state.doubts)
+            times, rows = state.measurements.arrays(t + self._slack(t))
+            doubts = (*state.doubts, *self.guaranteed.incomplete(times, rows, first))
+            fields["track"], bound = self.guaranteed.after(track, first, t, cost, status, doubts)
             fields["doubts"] = tuple(doubt for doubt in state.doubts if doubt[0] > edge)
         new = made(State, state.__dict__ | fields)
 

@@ -14,7 +14,7 @@ from ctmhe.estimators import MHE
 from ctmhe.models.library import batch_reactor
 from ctmhe.transcription import RK4
 from ctmhe.types import Bounds, DiscountedCost, Measurement
-from tests.conftest import P_REACTOR
+from tests.conftest import P_REACTOR, linear_model
 
 MODEL = batch_reactor()
 CERTIFICATE = DetectabilityCertificate(
@@ -188,6 +188,31 @@ def test_estimating_again_at_one_time_keeps_the_bound():
     state, again = mhe.estimate(state, 2.5)
     assert again.bound.level == pytest.approx(first.bound.level, rel=1e-6)
     assert len(state.track.ends) == len(set(state.track.ends))
+
+
+def test_missing_values_cost_the_bound():
+    """A record without a value, or without one of a sensor, is not the whole signal: windows with it have no bound."""
+    mhe = reactor()
+    state, _ = observed(mhe, until=1.0)
+    state, estimate = mhe.estimate(mhe.observe(state, Measurement(1.0, [np.nan])), 1.0)
+    assert estimate.bound.reasons == ("no output has a value at t = 1 s",)
+    model = linear_model([[-1.0]], [[1.0]], [[1.0], [1.0]])
+    certificate = DetectabilityCertificate([[1.0]], [[1.0]], [[1.0]], np.eye(2), np.exp(-1.0))
+    pair = MHE(
+        model,
+        horizon=2.0,
+        interval=0.1,
+        integrator=RK4(0.1),
+        cost=DiscountedCost.from_certificate(certificate),
+        hold="zero",
+        guarantee=Guarantee(certificate, 0.1, error=1.0),
+    )
+    state = pair.observe(pair.init(x=[0.0]), Measurement(0.0, [0.1, 0.1]))
+    assert pair.estimate(state, 0.2)[1].bound.size is not None
+    half = pair.observe(state, Measurement(0.1, {"y0": 0.1}))
+    assert pair.estimate(half, 0.2)[1].bound.reasons == ("no value of y1 at t = 0.1 s",)
+    whole = pair.observe(half, Measurement(0.1, {"y1": 0.1}))
+    assert pair.estimate(whole, 0.2)[1].bound.size is not None
 
 
 def test_without_guarantee_there_is_no_bound():
