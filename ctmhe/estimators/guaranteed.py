@@ -64,9 +64,14 @@ class Guaranteed:
         ]
         return tuple(f"parameter {name} lies outside the certificate's domain" for name in out)
 
-    def incomplete(self, times: Array, rows: Array, start: float) -> Doubts:
-        """Return a doubt for the last record from `start` on in which an output has no value."""
-        gaps = np.flatnonzero(np.isnan(rows).any(axis=1) & (times >= start - self.bounds.slack))
+    def incomplete(self, times: Array, rows: Array, start: float, end: float) -> Doubts:
+        """Return a doubt where a record of the window lacks an output, or a step of a discrete model its record."""
+        step, slack = self.model.step, self.bounds.slack
+        if step is not None:
+            known = int(np.count_nonzero((times >= start - slack) & (times < end - slack)))
+            if (lacking := round((end - start) / step) - known) > 0:
+                return ((np.inf, f"{lacking} steps of the window have no measurement"),)
+        gaps = np.flatnonzero(np.isnan(rows).any(axis=1) & (times >= start - slack))
         if not len(gaps):
             return ()
         k = int(gaps[-1])

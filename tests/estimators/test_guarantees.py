@@ -11,6 +11,7 @@ from ctmhe.certificates.certificate import DetectabilityCertificate
 from ctmhe.certificates.guarantee import Guarantee
 from ctmhe.errors import InputError
 from ctmhe.estimators import MHE
+from ctmhe.models import DiscreteModel
 from ctmhe.models.library import batch_reactor
 from ctmhe.transcription import RK4
 from ctmhe.types import Bounds, DiscountedCost, Measurement
@@ -213,6 +214,21 @@ def test_missing_values_cost_the_bound():
     assert pair.estimate(half, 0.2)[1].bound.reasons == ("no value of y1 at t = 0.1 s",)
     whole = pair.observe(half, Measurement(0.1, {"y1": 0.1}))
     assert pair.estimate(whole, 0.2)[1].bound.size is not None
+
+
+def test_steps_without_a_measurement_cost_the_bound():
+    """A discrete model's windows need the output of every step."""
+    model = DiscreteModel(
+        lambda t, x, u, w, p: [0.5 * x[0] + w[0]], lambda t, x, u, w, p: [x[0]], step=0.1, x=("x",), w=("w",), y=("y",)
+    )
+    certificate = DetectabilityCertificate([[1.0]], [[1.0]], [[2.0]], [[1.0]], 0.5, step=0.1)
+    cost, guarantee = DiscountedCost.from_certificate(certificate), Guarantee(certificate, 0.1, error=1.0)
+    mhe = MHE(model, horizon=1.0, cost=cost, guarantee=guarantee)
+    state = mhe.init(x=[0.0])
+    for k in (0, 1, 3):
+        state = mhe.observe(state, Measurement(0.1 * k, [0.0]))
+    assert mhe.estimate(state, 0.2)[1].bound.certified
+    assert mhe.estimate(state, 0.4)[1].bound.reasons == ("1 steps of the window have no measurement",)
 
 
 def test_without_guarantee_there_is_no_bound():
