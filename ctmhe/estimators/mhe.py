@@ -570,8 +570,10 @@ class MHE:
         if self.guaranteed is not None:
             first = float(solved.part("t")[0])
             track = state.track or self.guaranteed.begin(state.t0, state.start[: self.stage.nx])
-            times, rows = state.measurements.arrays(t + self._slack(t))
-            doubts = (*state.doubts, *self.guaranteed.incomplete(times, rows, first, t))
+            doubts = state.doubts
+            if not any(when > first for when, _ in doubts):
+                times, rows = state.measurements.arrays(t + self._slack(t))
+                doubts = self.guaranteed.incomplete(times, rows, first, t)
             fields["track"], bound = self.guaranteed.after(track, first, t, cost, status, doubts)
             fields["doubts"] = tuple(doubt for doubt in state.doubts if doubt[0] > edge)
         new = made(State, state.__dict__ | fields)
