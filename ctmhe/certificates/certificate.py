@@ -143,7 +143,10 @@ class DetectabilityCertificate:
 
 def as_matrix(value: Any, n: int, what: str) -> Array:
     """Return a scalar, a diagonal or a matrix as a matrix (n, n)."""
-    array = np.asarray(value, dtype=float)
+    try:
+        array = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"{what}: expected numbers, got {value!r}") from None
     if array.ndim == 0:
         return array * np.eye(n)
     if array.shape == (n,):
@@ -161,7 +164,9 @@ def definite(value: Any, what: str, *, zero: bool = False) -> Array:
     if not np.allclose(array, array.T, rtol=1e-8, atol=1e-12 * max(np.abs(array).max(initial=0.0), 1e-300)):
         raise InputError(f"{what} must be symmetric, got {array}")
     array = (array + array.T) / 2
-    if len(array) and (least := np.linalg.eigvalsh(array)[0]) <= (-1e-9 * np.abs(array).max() if zero else 0):
+    sizes = np.sqrt(np.maximum(np.abs(np.diagonal(array)), 1e-300))  # entries may have very different units
+    least = np.linalg.eigvalsh(array / sizes[:, None] / sizes)[0] if len(array) else 1.0
+    if least < -1e-9 if zero else least <= 0:
         kind = "semidefinite" if zero else "definite"
-        raise InputError(f"{what} must be positive {kind}; its smallest eigenvalue is {least:.3g}")
+        raise InputError(f"{what} must be positive {kind}; its smallest eigenvalue, of unit diagonal, is {least:.3g}")
     return array

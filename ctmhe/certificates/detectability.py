@@ -11,7 +11,7 @@ from scipy.linalg import eigh
 from scipy.optimize import minimize_scalar
 
 from ctmhe.certificates.certificate import DetectabilityCertificate, as_matrix, definite
-from ctmhe.certificates.diagnosis import demand_continuity, leaving, point, unseen_mode
+from ctmhe.certificates.diagnosis import leaving, point, unseen_mode
 from ctmhe.certificates.increments import Cover, Increments, Jacobians
 from ctmhe.certificates.inequality import GAIN, Form, Program, Sizes, Wanted
 from ctmhe.certificates.injection import Units
@@ -24,8 +24,10 @@ SLACKS = (1e-7, 1e-6, 1e-5, 1e-4)
 FRESH, FIRST, ROUNDS = 2000, 8, 25
 MANY, HASTE = 64, 1.25
 """From how many Jacobians on the program is asked for how much more of -ln eta: few of them then suffice."""
-ROUNDING = 1e-14
-"""Of the largest entry: an eigenvalue that is not below its negative is taken for zero."""
+ROUNDING = 1e-12
+"""Of the terms that an eigenvalue is the difference of: one that is not below its negative is taken for zero."""
+FASTEST = 500.0
+"""Per second, or step: eta = exp(-rate) is a number then."""
 
 
 def certify_detectability(
@@ -87,10 +89,11 @@ def certify_detectability(
     """
     found = _asked(model, eta, rate, objective, P, Q, R)
     increments = Increments(model, domain, u=u)
-    demand_continuity(increments)
     search = Search(increments, _cover(increments, jacobians), seed)
     eta, form = found.answer(search)
     values, pairs = search.fresh(form, eta, FRESH, seed + 1)
+    if not search.holds(form, eta, pairs):
+        raise CertificateError(search.fails(form, eta))
     top = found.wanted.P if found.objective == "horizon" and found.wanted.P is not None else form.P
     notes = list(leaving(increments))
     if search.program.varies:
@@ -150,10 +153,10 @@ def _asked(
     if eta is not None and rate is not None:
         raise InputError(f"{what}: give eta or rate (-ln eta), not both")
     if rate is not None:
-        if not (np.isfinite(rate) and rate > 0):
-            raise InputError(f"{what}: rate must be positive, per second or step, got {rate!r}")
+        if not (isinstance(rate, (int, float)) and 0 < rate <= FASTEST):
+            raise InputError(f"{what}: rate must be positive, and {FASTEST:g} per second or step at most, got {rate!r}")
         eta = float(np.exp(-rate))
-    if eta is not None and not 0 < eta < 1:
+    if eta is not None and not (isinstance(eta, (int, float)) and 0 < eta < 1):
         raise InputError(f"{what}: eta must lie in (0, 1), a factor per second or step, got {eta!r}")
     objective = objective or ("rate" if eta is None else "gain")
     if objective not in OBJECTIVES:
@@ -209,26 +212,26 @@ class Search:
                 why = None if quick else unseen_mode(self.increments, eta)
                 said = f": {why}. No weights help; try a slower rate" if why else f": {error}"
                 raise CertificateError(f"no quadratic function at eta = {eta:.6g}{said}") from None
-            margins = self.sizes.margins(form, eta, self.points)
-            failing = np.flatnonzero(margins < self._rounding(form))
+            margins = self.sizes.relative(form, eta, self.points)
+            failing = np.flatnonzero(~(margins >= -ROUNDING))
             new = np.setdiff1d(failing, self.active)
             if len(new):
                 self.active = np.union1d(self.active, self._worst(new, margins))
             elif len(failing):
                 if self._checked(wanted) or len(slacks) == 1:
-                    raise CertificateError(self._fails(form, eta))
+                    raise CertificateError(self.fails(form, eta))
                 slacks.pop(0)
             elif quick:
                 return form
             else:
                 values, pairs = self.fresh(form, eta, FRESH, self.seed + 100 + round_)
-                if values[0] >= self._rounding(form):
+                if self.holds(form, eta, pairs):
                     return form
                 if self.cover.rigorous or self._checked(wanted):
-                    raise CertificateError(self._fails(form, eta))
+                    raise CertificateError(self.fails(form, eta))
                 self._add(self.increments.at(pairs[values < 0].reshape(-1, pairs.shape[2])))
         assert form is not None
-        raise CertificateError(self._fails(form, eta))
+        raise CertificateError(self.fails(form, eta))
 
     def fastest(self, wanted: Wanted) -> tuple[float, Form]:
         """Return the smallest eta for which a form is found, to one per mille of -ln eta, and the form."""
@@ -236,7 +239,7 @@ class Search:
             raise CertificateError(f"model {self.increments.model.name!r} is not detectable: {why}")
         best: tuple[float, Form] | None = None
         pace, bracket, last = self.program.pace, [0.0, np.inf], CertificateError()
-        rate = 0.05 * (pace if not self.sizes.units.discrete else 1.0)
+        rate = min(0.05 * (pace if not self.sizes.units.discrete else 1.0), FASTEST)
         for _ in range(40):
             try:
                 best = (rate, self.form(float(np.exp(-rate)), wanted, quick=True))
@@ -244,9 +247,10 @@ class Search:
             except CertificateError:
                 bracket[1] = rate
             low, high = bracket
-            if high < 1e-6 * pace or (low > 0 and high / low < 1.001) or low > 500:
+            if high < 1e-6 * pace or (low > 0 and high / low < 1.001) or low >= FASTEST:
                 break
             rate = rate / 8 if not low else rate * 4 if high == np.inf else float(np.sqrt(low * high))
+            rate = min(rate, FASTEST)
         if best is None:
             raise CertificateError(
                 f"model {self.increments.model.name!r}: no quadratic function at any rate on this domain, although no "
@@ -332,13 +336,14 @@ class Search:
             return Form(wanted.P, wanted.W, wanted.R)  # pyright: ignore[reportArgumentType]
         return self.program.solve(self.points.take(self.active), eta, wanted)
 
-    def _rounding(self, form: Form) -> float:
-        units = self.sizes.units
-        return -ROUNDING * max(
-            np.abs(unit @ part @ unit).max() for unit, part in ((units.x, form.P), (units.y, form.R))
-        )
+    def holds(self, form: Form, eta: float, pairs: Array) -> bool:
+        """Return whether the inequality holds at points, or pairs of them, that `fresh` returned, to rounding."""
+        first, second = pairs[:, 0], pairs[:, 1]
+        jacobians = self.increments.between(first, second) if self.program.varies else self.increments.at(first)
+        return bool((self.sizes.relative(replace(form, N=None), eta, jacobians) >= -ROUNDING).all())
 
-    def _fails(self, form: Form, eta: float) -> str:
+    def fails(self, form: Form, eta: float) -> str:
+        """Return where and by how much a form fails, in words."""
         values, pairs = self.fresh(form, eta, FRESH, self.seed)
         margin, v = float(values[0]), pairs[0, 0]
         least = min(margin, float(self.sizes.margins(form, eta, self.points).min()))

@@ -7,39 +7,9 @@ import numpy as np
 
 from ctmhe.certificates.increments import Increments
 from ctmhe.certificates.injection import Units
-from ctmhe.errors import InputError
 from ctmhe.types import Array
 
-JUMPS = {
-    ca.OP_SIGN: "sign",
-    ca.OP_FLOOR: "floor",
-    ca.OP_CEIL: "ceil",
-    ca.OP_FMOD: "fmod",
-    ca.OP_COPYSIGN: "copysign",
-    ca.OP_IF_ELSE_ZERO: "if_else",
-    ca.OP_LT: "<",
-    ca.OP_LE: "<=",
-    ca.OP_EQ: "==",
-    ca.OP_NE: "!=",
-    ca.OP_NOT: "not",
-}
 SAMPLES = 200
-
-
-def demand_continuity(increments: Increments) -> None:
-    """Raise if a function of the model may jump: no Jacobian sees that, and mean values of it say nothing."""
-    model = increments.model
-    for function, label in ((model.dynamics, "f"), (model.output, "h")):
-        if not increments.symbolic:
-            return
-        used = {function.instruction_id(k) for k in range(function.n_instructions())}
-        found = [name for operation, name in JUMPS.items() if operation in used]
-        if found:
-            raise InputError(
-                f"model {model.name!r}: {label} uses {', '.join(found)} and may jump, which its Jacobians do not show; "
-                "write it with smooth functions (ca.tanh, ca.sqrt), or with ca.fabs, ca.fmin and ca.fmax if it is "
-                "continuous"
-            )
 
 
 def combination(names: tuple[str, ...], vector: Array) -> str:

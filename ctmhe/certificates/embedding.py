@@ -170,21 +170,47 @@ def is_rough(function: ca.Function) -> bool:
     return any(function.instruction_id(k) in ROUGH for k in range(function.n_instructions()))
 
 
-def degrees_of(values: Any, v: Any, nominal: Array) -> np.ndarray:
-    """Return the degree of expressions in every entry of v; DEGREE + 1 for more, or where they are no polynomials."""
-    rng, found = np.random.default_rng(0), np.zeros(len(nominal), dtype=int)
-    points = ca.DM(nominal[:, None] * rng.normal(size=(len(nominal), 12)))
-    for i in range(len(nominal)):
-        derivative, scale = values, 0.0
-        while found[i] <= DEGREE:
-            derivative = ca.jacobian(derivative, v[i])
-            if derivative.nnz() == 0:
-                break
-            size = np.abs(np.asarray(ca.DM(ca.Function("d", [v], [ca.densify(derivative)])(points))))
-            scale = max(scale, np.nanmax(size, initial=0.0))
-            if np.isfinite(size).all() and size.max(initial=0.0) <= 1e-12 * scale:
-                break  # analytic functions that vanish at random points vanish everywhere
-            found[i] += 1
+def degrees_of(values: Any, v: Any) -> np.ndarray:
+    """Return a bound of the degree of expressions in every entry of v; DEGREE + 1 where they may be no polynomials.
+
+    From the instructions, so that it holds: what cancels is not seen to.
+    """
+    function = ca.Function("values", [v], [values])
+    n, other = v.numel(), DEGREE + 1
+    held: dict[int, np.ndarray] = {}
+    numbers: dict[int, float] = {}
+    found = np.zeros(n, dtype=int)
+    for k in range(function.n_instructions()):
+        code, into, out = function.instruction_id(k), function.instruction_input(k), function.instruction_output(k)
+        if code == ca.OP_OUTPUT:
+            found = np.maximum(found, held[into[0]])
+            continue
+        number = None
+        if code == ca.OP_CONST:
+            degree, number = np.zeros(n, dtype=int), float(function.instruction_constant(k))
+        elif code == ca.OP_INPUT:
+            degree = np.eye(n, dtype=int)[into[1]]
+        else:
+            parts = [held[register] for register in into]
+            powers = numbers.get(into[1]) if len(into) > 1 else None
+            if code in (ca.OP_ADD, ca.OP_SUB):
+                degree = np.maximum(*parts)
+            elif code in (ca.OP_ASSIGN, ca.OP_NEG, ca.OP_TWICE):
+                degree = parts[0]
+            elif code == ca.OP_MUL:
+                degree = parts[0] + parts[1]
+            elif code == ca.OP_SQ:
+                degree = 2 * parts[0]
+            elif code == ca.OP_DIV and not parts[1].any():
+                degree = parts[0]
+            elif code in (ca.OP_POW, ca.OP_CONSTPOW) and powers is not None and powers >= 0 and powers % 1 == 0:
+                degree = int(powers) * parts[0]
+            else:
+                degree = other * (np.sum(parts, axis=0) > 0)
+        held[out[0]] = np.minimum(degree, other)
+        numbers.pop(out[0], None)
+        if number is not None:
+            numbers[out[0]] = number
     return found
 
 
@@ -225,7 +251,10 @@ def hull_points(values: Any, v: Any, lower: Array, upper: Array, *, smooth: bool
     smooth : bool
         Whether the values are analytic.
     """
-    given = reduced(values, v, lower, upper)
+    try:
+        given = reduced(values, v, lower, upper)
+    except NotImplementedError:  # an instruction without an interval version
+        return None
     if not np.isfinite([given.lower, given.upper]).all():
         return None
     function = ca.Function("values", [given.variables], [given.values])
@@ -244,8 +273,7 @@ def hull_points(values: Any, v: Any, lower: Array, upper: Array, *, smooth: bool
 
 
 def _interpolated(given: Reduced, at: Callable[[Array], Array]) -> Array | None:
-    size = np.maximum(np.abs(given.lower), np.abs(given.upper))
-    degrees = degrees_of(given.values, given.variables, np.where(size > 0, size, 1.0))
+    degrees = degrees_of(given.values, given.variables)
     tape = Intervals(given.values, given.variables)
     rules = []
     for i, degree in enumerate(degrees):

@@ -32,6 +32,26 @@ MOST_POINTS, GRID_POINTS, KEPT = 20_000, 400, 40
 AT_ONCE = 80
 """Jacobians that a program takes which has to see all of them at once; domains that need more are sampled for it."""
 
+REMAINDER = getattr(ca, "OP_REMAINDER", 97)
+JUMPS = {
+    ca.OP_SIGN: "sign",
+    ca.OP_FLOOR: "floor",
+    ca.OP_CEIL: "ceil",
+    ca.OP_FMOD: "fmod",
+    ca.OP_COPYSIGN: "copysign",
+    ca.OP_IF_ELSE_ZERO: "if_else",
+    ca.OP_LT: "<",
+    ca.OP_LE: "<=",
+    ca.OP_EQ: "==",
+    ca.OP_NE: "!=",
+    ca.OP_NOT: "not",
+    ca.OP_AND: "and",
+    ca.OP_OR: "or",
+    ca.OP_ATAN2: "atan2",
+    REMAINDER: "remainder",
+}
+"""Instructions that may jump, as users write them: no Jacobian sees that, and mean values of it say nothing."""
+
 
 class Jacobians(NamedTuple):
     """Derivatives (7.39) at k points, of f by x, w, p and of h by x, w, p, in the model's units.
@@ -95,7 +115,7 @@ class Increments:
     Raises
     ------
     InputError
-        If a Jacobian depends on a signal without finite bounds, or the model on time.
+        If a Jacobian depends on a signal without finite bounds, the model on time, or if it may jump.
     """
 
     def __init__(self, model: Model, domain: Bounds | None = None, *, u: Any = None):
@@ -127,14 +147,24 @@ class Increments:
         self.varying = np.arange(len(self.names))
         if self.symbolic:
             self._expression, self._rough = (blocks, v), is_rough(self._at)
-            degrees = degrees_of(stacked, v, self.nominal)
-            moves = [ca.depends_on(stacked, v[i]) for i in range(len(self.names))] if self._rough else degrees
-            self.varying = np.flatnonzero(moves)  # a derivative says nothing of a jump
+            self._demand_continuity()
+            degrees = degrees_of(stacked, v)
+            self.varying = np.flatnonzero(degrees)
             self.degrees = degrees if (degrees <= DEGREE).all() and not self._rough else None
         self._demand_bounds()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _rebuilt, (self.model, *self._boxes)  # expressions cannot be pickled
+
+    def _demand_continuity(self) -> None:
+        for function, label in ((self.model.dynamics, "f"), (self.model.output, "h")):
+            used = {function.instruction_id(k) for k in range(function.n_instructions())}
+            if found := [name for operation, name in JUMPS.items() if operation in used]:
+                raise InputError(
+                    f"model {self.model.name!r}: {label} uses {', '.join(found)} and may jump, which its Jacobians do "
+                    "not show; write it with smooth functions (ca.tanh, ca.sqrt, ca.atan for atan2 where x > 0), or with "
+                    "ca.fabs, ca.fmin and ca.fmax if it is continuous"
+                )
 
     def _demand_bounds(self) -> None:
         free = [i for i in self.varying if not np.isfinite([self.lower[i], self.upper[i]]).all()]
@@ -344,7 +374,7 @@ def _farthest(jacobians: Jacobians, which: str) -> Jacobians:
 
 def constant(parts: Array) -> bool:
     """Return whether k matrices are the same, to rounding."""
-    return bool(np.ptp(parts, axis=0).max(initial=0.0) <= 1e-11 * np.abs(parts).max(initial=1.0))
+    return bool(np.ptp(parts, axis=0).max(initial=0.0) <= 1e-11 * np.abs(parts).max(initial=0.0))
 
 
 def _rebuilt(model: Model, domain: Bounds, u: Any) -> Increments:

@@ -85,6 +85,26 @@ class Sizes:
         gap = self.scale @ gap @ self.scale
         return (gap + gap.transpose(0, 2, 1)) / 2
 
+    def relative(self, form: Form, eta: float, jacobians: Jacobians) -> Array:
+        """Return the smallest eigenvalue of the gap, each row over the size of the terms on its diagonal (k,).
+
+        Free of units: what is below zero by more than rounding is below zero.
+        """
+        f, h = (np.abs(part) for part in self.stacked(jacobians))
+        P, R, n = np.abs(form.P), np.abs(form.R), len(form.P)
+        terms = np.abs(np.diagonal(block_diag((eta if self.units.discrete else np.log(eta)) * form.P, *form.W)))
+        seen = np.einsum("kyi,yz,kzi->ki", h, R, h)
+        if form.N is not None:
+            N = np.abs(form.N)
+            seen = 2 * np.einsum("kyi,yi->ki", h, N) + np.einsum("yi,yz,zi->i", N, np.abs(np.linalg.inv(form.R)), N)
+        moved = np.einsum("kni,nm,kmi->ki", f, P, f)
+        if not self.units.discrete:
+            moved = np.zeros_like(seen)
+            moved[:, :n] = 2 * np.einsum("nm,kmn->kn", P, f[:, :, :n])
+        scale = np.sqrt(np.maximum(terms + seen + moved, 1e-300)) * np.diagonal(self.scale)
+        gaps = self.gaps(form, eta, jacobians) / (scale[:, :, None] * scale[:, None, :])
+        return np.linalg.eigvalsh(gaps)[:, 0]
+
     def margins(self, form: Form, eta: float, jacobians: Jacobians) -> Array:
         """Return the smallest eigenvalue of the gap in nominal units at k points (k,); not negative: it holds."""
         return np.linalg.eigvalsh(self.gaps(form, eta, jacobians))[:, 0]

@@ -184,7 +184,7 @@ class _Search:
             made = ca.vertcat(b, *(after[k] * ca.vertcat(1, A) for k in range(after.numel())))
         self.values = ca.Function("values", [v], [b, after])
         self.expression, self.v, self.f = ca.densify(made), v, f
-        self.degrees = degrees_of(self.expression, v, increments.nominal)
+        self.degrees = degrees_of(self.expression, v)
         self.varying = np.flatnonzero(self.degrees)
         self.polynomial = not is_rough(ca.Function("m", [v], [self.expression])) and (self.degrees <= DEGREE).all()
         ends = np.array([increments.lower[self.varying], increments.upper[self.varying]])
