@@ -88,6 +88,8 @@ def certify_detectability(
         fit.
     """
     found = _asked(model, eta, rate, objective, P, Q, R)
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise InputError(f"certify_detectability: seed must be a whole number, not negative, got {seed!r}")
     increments = Increments(model, domain, u=u)
     search = Search(increments, _cover(increments, jacobians), seed)
     eta, form = found.answer(search)

@@ -161,8 +161,8 @@ class Increments:
             used = {function.instruction_id(k) for k in range(function.n_instructions())}
             if found := [name for operation, name in JUMPS.items() if operation in used]:
                 raise InputError(
-                    f"model {self.model.name!r}: {label} uses {', '.join(found)} and may jump, which its Jacobians "
-                    "do not show; write it with smooth functions (ca.tanh, ca.sqrt, ca.atan for atan2 where x > 0), or with "
+                    f"model {self.model.name!r}: {label} uses {', '.join(found)} and may jump; Jacobians do not tell. "
+                    "Write it with smooth functions (ca.tanh, ca.sqrt, ca.atan for atan2 where x > 0), or with "
                     "ca.fabs, ca.fmin and ca.fmax if it is continuous"
                 )
 

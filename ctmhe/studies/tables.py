@@ -124,4 +124,7 @@ def build_guess(table: Mapping[str, Any], model: Any, where: str) -> tuple[dict[
 
 def box_of(value: Any) -> Any:
     """Return a box of `Bounds`: a table of pairs, or one pair for all."""
-    return {name: tuple(pair) for name, pair in value.items()} if isinstance(value, Mapping) else tuple(value)
+    try:
+        return {name: tuple(pair) for name, pair in value.items()} if isinstance(value, Mapping) else tuple(value)
+    except TypeError:
+        raise InputError(f"a box is a pair [lower, upper], or a table of such pairs; got {value!r}") from None

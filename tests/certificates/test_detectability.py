@@ -297,3 +297,30 @@ def test_bounds_of_jacobians_make_a_proof_of_what_was_sampled():
     assert found.rigorous and "were given" in found.notes[0]
     with pytest.raises(InputError, match="outside the given bounds"):
         certify_detectability(kink, eta=0.5, jacobians={"A": ([[-1, 1], [0, -1.0]], [[-1, 1], [0, -0.9]])})
+
+
+@pytest.mark.parametrize("gain", [1e3, 1e14])
+def test_heavy_weights_hide_no_growth(gain):
+    """A growing state that no output sees is refused whatever R is: rounding is measured row by row."""
+    blind = shaped(lambda t, x, u, w, p: (-x[0] + w[0], 0.1 * x[1]), lambda t, x, u, w, p: x[0])
+    with pytest.raises(CertificateError, match=r"eta = 0\.9"):
+        certify_detectability(blind, eta=0.9, P=1.0, Q=10.0, R=gain)
+
+
+@pytest.mark.parametrize("steep", [lambda b: 5 * ca.tanh(b - 350), lambda b: 1e-3 * ca.tanh(3e4 * (b - 0.31))])
+def test_what_random_points_miss_is_seen_in_the_instructions(steep):
+    """A step that is steep somewhere off the nominal values is no constant, and no proof is made of it."""
+    hidden = shaped(lambda t, x, u, w, p: (-x[0] + w[0], -x[1] + steep(x[1])), lambda t, x, u, w, p: x[0])
+    with pytest.raises(InputError, match="without finite bounds"):
+        certify_detectability(hidden, Bounds(x={"a": (-1, 1)}), eta=0.7)
+    with pytest.raises(CertificateError):
+        certify_detectability(hidden, Bounds(x={"a": (-1, 1), "b": (-400, 400)}), eta=0.7)
+
+
+def test_the_simplest_model_of_all():
+    """Left to itself the rate of x' = -x + w, y = x + v is bounded by what noise may weigh, not by floating point."""
+    model = ContinuousModel(
+        lambda t, x, u, w, p: -x[0] + w[0], lambda t, x, u, w, p: x[0] + w[1], x="x", w=("w", "v"), y="y"
+    )
+    found = certify_detectability(model)
+    assert found.rigorous and 0 < found.eta < 0.4 and found.margin >= 0

@@ -53,6 +53,10 @@ def test_the_report_says_what_where_how_rigorous_and_how_long(case, tmp_path):
         ("batch_reactor", "reactor", "expected one of batch_reactor"),
         ("pA = ", "pC = ", "pC"),
         ("[domain]", "[domane]", "unknown key 'domane'"),
+        ("x = { pA = [0.1, 5.0] }", "x = 5.0", r"a box is a pair \[lower, upper\]"),
+        ("eta = 0.4", 'eta = "0.4"', r"eta must lie in \(0, 1\)"),
+        ("R = 1e2", 'R = "much"', "R: expected numbers"),
+        ("eta = 0.4", "eta = 0.4\nseed = -1", "seed must be a whole number"),
         ("wait = 0.19", "wait = -1", r"\[certificate\] wait must be a number >= 0"),
     ],
 )
