@@ -92,7 +92,8 @@ class Sizes:
         """
         f, h = (np.abs(part) for part in self.stacked(jacobians))
         P, R, n = np.abs(form.P), np.abs(form.R), len(form.P)
-        terms = np.abs(np.diagonal(block_diag((eta if self.units.discrete else np.log(eta)) * form.P, *form.W)))
+        weights = np.asarray(block_diag((eta if self.units.discrete else np.log(eta)) * form.P, *form.W))
+        terms = np.abs(np.diagonal(weights))
         seen = np.einsum("kyi,yz,kzi->ki", h, R, h)
         if form.N is not None:
             N = np.abs(form.N)
