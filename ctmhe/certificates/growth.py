@@ -76,7 +76,7 @@ class Growth:
 
 
 def predict_growth(model: Model, guarantee: Guarantee, *, u: Any = None) -> Growth:
-    """Bound how far a prediction without disturbance can move away from the truth.
+    """Bound how far a prediction without disturbance can move away from the truth, while both stay inside the domain.
 
     The difference e of both obeys de/dt = A e - B w, with A and B mean values of the Jacobians between them. So the
     norm |e|_P grows at most by half the largest eigenvalue of P A + A'P relative to P, and by |B w|_P. Both are convex

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from hashlib import sha256
 from itertools import product
 from typing import Any
 
@@ -22,8 +23,9 @@ class Guarantee:
     ----------
     certificate : DetectabilityCertificate
     disturbance : scalar, array (nw,) or mapping name -> value
-        Largest |w_i| that there can be, in the units of the model: process disturbances, measurement noise, and what
-        holding records between their times adds to it (about the output's slope times the time between records).
+        Largest |w_i| that there can be, in the units of the model: process disturbances, measurement noise, and what is
+        added to it by holding records between their times (about the output's slope times the time between records)
+        and by rounding them (half a quantum).
     error : scalar, array (nx,) or mapping name -> value, optional
         Largest initial error |chi_hat_i - chi_i|; what the certificate's domain leaves when left out.
     """
@@ -52,7 +54,9 @@ class Track:
     since, base : float
         From when on everything that Theorem 3.1 asks for was met, and a bound of U over the horizon before.
     period : float
-        Seconds between solves while they are equidistant, 0 before the second, NaN when they are not.
+        Seconds between solves while they are equidistant and windows start at them, 0 before the second, NaN when not.
+    key : str
+        Of the bounds that the levels belong to.
     """
 
     start: float
@@ -63,6 +67,7 @@ class Track:
     since: float = -np.inf
     base: float = np.inf
     period: float = 0.0
+    key: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +111,18 @@ class WindowBounds:
         """Seconds that the wait for a sample must stay below (3.29)."""
         return self.certificate.longest_wait(self.horizon / self.unit) * self.unit
 
+    @cached_property
+    def key(self) -> str:
+        """Text that tells these bounds from others."""
+        c = self.certificate
+        numbers = np.concatenate([part.ravel() for part in (c.P_lower, c.P_upper, c.Q, c.R)])
+        others = np.array([c.eta, self.unit, self.horizon, self.supply, self.cap])
+        return sha256(np.concatenate([numbers, others]).tobytes()).hexdigest()[:16]
+
+    def near(self, t: float) -> float:
+        """Return the seconds within which times at `t` are equal."""
+        return max(self.slack, 8 * float(np.spacing(abs(t))))
+
     def fade(self, seconds: float, eta: float | None = None) -> float:
         """Return eta^seconds in the certificate's units."""
         return float((self.certificate.eta if eta is None else eta) ** (seconds / self.unit))
@@ -118,16 +135,28 @@ class WindowBounds:
 
     def at(self, track: Track, t: float) -> float:
         """Return the bound of U(x_hat(t), x(t)) along the estimated trajectory (3.16) within the last horizon."""
-        if t <= track.start + self.slack:
-            return min(track.initial, self.cap)
+        if t <= track.start + self.near(t):
+            return track.initial
         for end, level in zip(track.ends, track.levels, strict=True):
-            if t <= end + self.slack:
-                return min(level / self.fade(max(end - t, 0.0)), self.cap)
+            if t <= end + self.near(t):
+                fade = self.fade(max(end - t, 0.0))
+                return min(level / fade, self.cap) if fade > 0 else self.cap
         return self.cap
+
+    def resumed(self, track: Track, t: float, *, since: float) -> Track:
+        """Return the track when what was done from `since` to the last solve at `t` rests on something else by now.
+
+        Pieces of the trajectory that end there are bounded by the domain only, and Theorem 3.1 starts anew.
+        """
+        near = self.near(t)
+        levels = tuple(
+            self.cap if end >= since - near else level for end, level in zip(track.ends, track.levels, strict=True)
+        )
+        return replace(track, levels=levels, since=t, base=self.cap, wait=0.0, period=np.nan, key=self.key)
 
     def before(self, track: Track, start: float) -> float:
         """Return V for a window that starts at `start`."""
-        if start <= track.start + self.slack:
+        if start <= track.start + self.near(start):
             return min(track.initial, self.cap)
         return min(self.certificate.ratio * self.at(track, start), self.cap)
 
@@ -138,17 +167,18 @@ class WindowBounds:
 
         `problems` say why the window is not what the theory is about; U is then bounded by the domain only.
         """
-        ends, levels = track.ends, track.levels
-        if ends and t <= ends[-1] + self.slack:  # a solve repeated takes its own place
+        ends, levels, near = track.ends, track.levels, self.near(t)
+        if ends and t <= ends[-1] + near:  # a solve repeated takes its own place
             ends, levels = ends[:-1], levels[:-1]
             track = replace(track, ends=ends, levels=levels)
         gap = t - (ends[-1] if ends else track.start)
-        period = gap if track.period <= self.slack else track.period
-        equal = gap <= self.slack or abs(gap - period) <= self.slack
+        period = gap if track.period <= near else track.period
+        equal = gap <= near or abs(gap - period) <= near
+        equal &= start <= track.start + near or any(abs(end - start) <= near for end in ends)
         past = replace(track, wait=max(track.wait, gap), period=period if equal else np.nan)
         most = 2 * (self.fade(t - start) * self.before(track, start) + self.energy(t - start))
         level = min(most + cost, self.cap) if not problems else self.cap
-        kept = [k for k, end in enumerate(ends) if end > t - self.horizon - self.slack]
+        kept = [k for k, end in enumerate(ends) if end > t - self.horizon - near]
         past = replace(past, ends=(*(ends[k] for k in kept), t), levels=(*(levels[k] for k in kept), level))
         reasons = tuple(problems) or self._unmet(past, cost, most)
         theorem = None
@@ -170,27 +200,33 @@ class WindowBounds:
         limit = self.limit
         if limit <= 0:
             return (f"the horizon of {self.horizon:g} s must exceed {self.horizon - limit:.4g} s (3.30)",)
-        if track.wait >= limit and not self._aligned(track):
+        if not self._aligned(track) and (track.wait >= limit or self._rho(track) >= 1):
             return (f"it waited {track.wait:.4g} s, and (3.29) allows less than {limit:.4g} s",)
         if cost > most * (1 + 1e-6) + 1e-12:
             return (
                 f"its cost of {cost:.4g} exceeds the {most:.4g} that the truth can cost: the solver found a worse "
-                "solution, or disturbances are larger than stated",
+                "solution, disturbances or the initial error are larger than stated, or bounds exclude the truth",
             )
         return ()
 
     def _aligned(self, track: Track) -> bool:
         """Return whether all windows start at solves, the horizon being a multiple of equal gaps (Remark 3.7)."""
         if not track.period > self.slack:
-            return track.period == 0
+            return track.period <= self.slack
         count = self.horizon / track.period
         return abs(count - round(count)) * track.period <= self.slack
 
+    def _rho(self, track: Track) -> float:
+        wait = 0.0 if self._aligned(track) else track.wait
+        return self.certificate.contraction(self.horizon / self.unit, wait=wait / self.unit)
+
     def _worst(self, track: Track) -> float:
         """Return a bound of U over the last horizon."""
+        last = track.ends[-1]
         levels = [self.at(track, end) for end in track.ends]
-        starts = [self.at(track, begin + 2 * self.slack) for begin in (track.start, *track.ends[:-1])]
-        early = [track.initial] if track.ends[-1] - track.start <= self.horizon else []
+        begins = (max(track.start, last - self.horizon), *track.ends[:-1])
+        starts = [self.at(track, begin + 2 * self.near(begin)) for begin in begins]
+        early = [track.initial] if last - track.start <= self.horizon else []
         return min(max(*levels, *starts, *early), self.cap)
 
     def _theorem(self, track: Track, t: float) -> float:
@@ -199,8 +235,7 @@ class WindowBounds:
         After an instant s at which it did not hold, its proof goes back from window to window as before, and ends with
         the first that starts at or before s: U there is at most `base`, or the window is the growing one of (3.28).
         """
-        wait, factor = (0.0, 4) if self._aligned(track) else (track.wait, 8)
-        rho = self.certificate.contraction(self.horizon / self.unit, wait=wait / self.unit)
+        rho, factor = self._rho(track), 4 if self._aligned(track) else 8
         elapsed, most = t - track.start, min(track.initial, self.cap)
         found = 4 * self.fade(elapsed, rho) * most if track.since < track.start + self.horizon else 0.0
         if np.isfinite(track.since):

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
+import casadi as ca
 import numpy as np
 
 from ctmhe.certificates.certificate import DetectabilityCertificate
 from ctmhe.certificates.guarantee import Guarantee, Track, WindowBounds, largest_square
 from ctmhe.errors import InputError
-from ctmhe.models.continuous import box_arrays
+from ctmhe.models.continuous import Model, box_arrays
 from ctmhe.transcription.weights import weight_matrix
 from ctmhe.types import Array, ErrorBound, Outcome, Status
 
@@ -35,6 +38,8 @@ class Guaranteed:
         if not isinstance(guarantee, Guarantee):
             raise InputError(f"guarantee: expected Guarantee(certificate, disturbance=...), got {guarantee!r}")
         own, model = guarantee.certificate, mhe.model
+        if not isinstance(own, DetectabilityCertificate):
+            raise InputError(f"guarantee: expected a DetectabilityCertificate, got {own!r}")
         n, nw, ny = len(model.x), len(model.w), len(model.y)
         if (own.P_upper.shape[0], own.Q.shape[0], own.R.shape[0]) != (n, nw, ny):
             raise InputError(
@@ -46,13 +51,14 @@ class Guaranteed:
         lower, upper = box_arrays(model.x, own.domain.x if own.domain else None, "domain of x")
         self.domain = lower, upper
         certificate, problems = _scaled(own, mhe)
-        self.unmet = (*problems, *_unmet(own, mhe))
+        self.hold_limit = mhe.hold_limit
+        self.unmet = (*problems, *_unmet(own, mhe), *_beyond(own, mhe, sizes))
         self.bounds = WindowBounds(
             certificate,
             mhe.horizon,
             supply=largest_square(certificate.Q, sizes),
             cap=largest_square(certificate.P_upper, upper - lower),
-            slack=1e-6 * mhe.interval,
+            slack=1e-9 * mhe.interval,
         )
 
     def outside(self, p: Array) -> tuple[str, ...]:
@@ -64,19 +70,38 @@ class Guaranteed:
         ]
         return tuple(f"parameter {name} lies outside the certificate's domain" for name in out)
 
-    def incomplete(self, times: Array, rows: Array, start: float, end: float) -> Doubts:
-        """Return a doubt where a record of the window lacks an output, or a step of a discrete model its record."""
-        step, slack = self.model.step, self.bounds.slack
+    def lacking(self, times: Array, rows: Array, start: float, end: float) -> tuple[str, ...]:
+        """Return what a window lacks of the whole signal: a value, the record of a step, or a stretch of time."""
+        step, near = self.model.step, self.bounds.near(end)
         if step is not None:
-            known = int(np.count_nonzero((times >= start - slack) & (times < end - slack)))
-            if (lacking := round((end - start) / step) - known) > 0:
-                return ((np.inf, f"{lacking} steps of the window have no measurement"),)
-        gaps = np.flatnonzero(np.isnan(rows).any(axis=1) & (times >= start - slack))
-        if not len(gaps):
-            return ()
-        k = int(gaps[-1])
-        names = [name for name, value in zip(self.model.y.names, rows[k], strict=True) if np.isnan(value)]
-        return ((np.inf, f"no value of {', '.join(names)} at t = {times[k]:g} s"),)
+            used = (times >= start - near) & (times < end - near)
+            if (missing := round((end - start) / step) - int(np.count_nonzero(used))) > 0:
+                return (f"{missing} steps of the window have no measurement",)
+        else:
+            used = (times >= _governing(times, start + near)) & (times <= end + near)
+        gaps = np.flatnonzero(np.isnan(rows).any(axis=1) & used)
+        if len(gaps):
+            k = int(gaps[-1])
+            names = [name for name, value in zip(self.model.y.names, rows[k], strict=True) if np.isnan(value)]
+            return (f"no value of {', '.join(names)} at t = {times[k]:g} s",)
+        if step is None and end > start + near:
+            if not len(times) or times[0] > start + near:
+                return (f"nothing is measured from the window's start at {start:g} s on",)
+            longest = float(np.diff(np.append(times[used], end)).max())
+            if longest > self.hold_limit + near:
+                return (
+                    f"nothing is measured for {longest:.4g} s, longer than a value is held ({self.hold_limit:g} s)",
+                )
+        return ()
+
+    def resume(self, track: Track | None, t0: float, x0: Array, t: float) -> Track:
+        """Return the track to go on with at a state, last solved at `t`, that may come from another configuration."""
+        if track is not None and track.key == self.bounds.key:
+            return track
+        fresh = self.begin(t0, x0)
+        if t <= t0 + self.bounds.near(t0):
+            return fresh
+        return self.bounds.resumed(replace(fresh, ends=(t,), levels=(self.bounds.cap,)), t, since=t)
 
     def begin(self, t: float, x: Array) -> Track:
         """Return the track at the start: how wrong the initial estimate `x` (nx,) can be."""
@@ -85,24 +110,54 @@ class Guaranteed:
         if self.guarantee.error is not None:
             given = _spread(self.guarantee.error, len(x))
             sizes = np.abs(self.model.x.vector(given, "guarantee: error"))
-        return Track(t, largest_square(self.bounds.certificate.P_upper, sizes))
+        return Track(t, largest_square(self.bounds.certificate.P_upper, sizes), key=self.bounds.key)
+
+    def current(self, doubts: Doubts, times: Array, start: float) -> Doubts:
+        """Return the doubts that concern windows from `start` on: what is wrong stays held until the next record."""
+        near = self.bounds.near(start)
+        ahead = [float(times[times > when + near].min(initial=np.inf)) for when, _ in doubts]
+        return tuple(doubt for doubt, until in zip(doubts, ahead, strict=True) if until > start + near)
 
     def after(
-        self, track: Track, start: float, t: float, cost: float, status: Status, doubts: Doubts
+        self, track: Track, start: float, t: float, cost: float, status: Status, reasons: Sequence[str]
     ) -> tuple[Track, ErrorBound]:
-        """Return the track and the bound after a solve."""
+        """Return the track and the bound after a solve; `reasons` say what is doubtful or lacking in its window."""
+        found = list(dict.fromkeys(reasons))
         problems = list(self.unmet)
-        found = list(dict.fromkeys(why for when, why in doubts if when > start))
         problems += found[-1:] if len(found) < 2 else [f"{found[-1]}, and {len(found) - 1} more like it in this window"]
         if not (status.outcome in (Outcome.SOLVED, Outcome.FALLBACK) and status.success):
             problems.append(f"the estimate need not be a trajectory of the model: {status.outcome.value}")
-        lacking = ("prior predicted, uncertified", "no measurement in window")
-        problems += [note for note in status.notes if note in lacking and t > start]
+        if t > start and "prior predicted, uncertified" in status.notes:
+            problems.append("prior predicted, uncertified")
         return self.bounds.after(track, start, t, cost, problems)
 
 
+def _governing(times: Array, t: float) -> float:
+    """Return the time of the last record at or before `t`, -inf if there is none."""
+    return float(times[times <= t].max(initial=-np.inf))
+
+
+def measurement_noise(model: Model) -> tuple[Array, Array] | None:
+    """Return which entries of w enter outputs only, and the matrix (., ny) that makes up for an output error with them.
+
+    None where they cannot make up for every error.
+    """
+    x, u, w, p = (np.asarray(getattr(model, key).nominal) for key in "xuwp")
+    symbolic = model.dynamics.is_a("SXFunction") and model.output.is_a("SXFunction")
+    kind: Any = ca.SX if symbolic else ca.MX
+    free = kind.sym("w", len(w))
+    f, h = (ca.jacobian(function(0.0, x, u, free, p), free) for function in (model.dynamics, model.output))
+    B, D = (np.asarray(ca.DM(ca.Function("J", [free], [ca.densify(part)])(w))) for part in (f, h))
+    silent = [f[:, i].nnz() == 0 if symbolic else not B[:, i].any() for i in range(len(w))]
+    noise = np.flatnonzero(silent)
+    if not len(noise) or np.linalg.matrix_rank(D[:, noise]) < len(model.y):
+        return None
+    return noise, np.linalg.pinv(D[:, noise])
+
+
 def _spread(value: object, n: int) -> object:
-    return np.full(n, value, dtype=float) if isinstance(value, (int, float)) else value
+    scalar = np.ndim(value) == 0 and isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+    return np.full(n, float(value)) if scalar else value  # type: ignore[arg-type]
 
 
 def _scaled(own: DetectabilityCertificate, mhe: MHE) -> tuple[DetectabilityCertificate, list[str]]:
@@ -143,6 +198,10 @@ def _unmet(own: DetectabilityCertificate, mhe: MHE) -> list[str]:
     pointed = [name for name, kind in mhe.hold.items() if kind == "point" and model.step is None]
     if pointed:
         problems.append(f"single samples of {', '.join(pointed)}: the theory needs the whole signal")
+    elif model.step is None and measurement_noise(model) is None:
+        problems.append(
+            "the model has no measurement noise in every output, which has to account for holding records: add it to w"
+        )
     if mhe.assembly.filtering:
         problems.append("the filtering form (3.6) has no bound here: leave filtering out")
     for key, group in (("x", model.x), ("w", model.w)):
@@ -153,3 +212,11 @@ def _unmet(own: DetectabilityCertificate, mhe: MHE) -> list[str]:
             named = ", ".join(name for name, out in zip(group.names, outside, strict=True) if out)
             problems.append(f"{named} may leave the certificate's domain: give the MHE bounds that keep to it (3.12d)")
     return problems
+
+
+def _beyond(own: DetectabilityCertificate, mhe: MHE, sizes: Array) -> list[str]:
+    """Return which stated disturbances the certificate does not speak of."""
+    w = mhe.model.w
+    lower, upper = box_arrays(w, own.domain.w if own.domain else None, "domain of w")
+    out = [name for name, size, a, b in zip(w.names, sizes, lower, upper, strict=True) if -size < a or size > b]
+    return [f"disturbances as large as stated leave the certificate's domain: {', '.join(out)}"] if out else []

@@ -290,11 +290,21 @@ class MHE:
     def doubt(self, state: State, t: float, reason: str) -> State:
         """Return the state that knows that its data at `t` are not what a guarantee assumes, such as a lost message.
 
-        Estimates whose window reaches back to `t` then have no bound, for this reason; never again one if `t` is
-        infinite.
+        Estimates whose window reaches back to `t`, or to before the next record, then have no bound, for this reason;
+        never again one if `t` is infinite.
         """
-        doubts = (*state.doubts, (float(t), reason))
-        return made(State, state.__dict__ | {"doubts": doubts})
+        state = _checked(state, self)
+        if not isinstance(t, (int, float, np.number)) or np.isnan(t) or not isinstance(reason, str):
+            raise InputError(f"doubt: expected a time in seconds (inf: for good) and a reason, got {t!r}, {reason!r}")
+        state = self._revised(state, float(t))
+        return made(State, state.__dict__ | {"doubts": (*state.doubts, (float(t), reason))})
+
+    def _revised(self, state: State, t: float) -> State:
+        """Return the state whose bounds do not rest on what was solved with other data at `t` and later."""
+        if self.guaranteed is None or state.track is None or t >= state.t - self._slack(t):
+            return state
+        track = self.guaranteed.bounds.resumed(state.track, state.t, since=t)
+        return made(State, state.__dict__ | {"track": track})
 
     @staticmethod
     def _named(signals: Signals, values: Any, default: Array) -> Any:
@@ -334,7 +344,7 @@ class MHE:
                     "same time; give each sample its own time"
                 )
             row = np.where(np.isfinite(row), row, known)
-        return state.knowing(state.measurements.put(t, row), state.inputs)
+        return self._revised(state, t).knowing(state.measurements.put(t, row), state.inputs)
 
     def control(self, state: State, value: Input) -> State:
         """Return the state that also knows the input from `value.t` on; at one time the last one given counts."""
@@ -346,7 +356,7 @@ class MHE:
             u = self.model.u.vector(u, f"input at t = {value.t:g}")
         if state.solves:
             self._check_age(state, value.t, "input")
-        return state.knowing(state.measurements, state.inputs.put(value.t, u))
+        return self._revised(state, value.t).knowing(state.measurements, state.inputs.put(value.t, u))
 
     def _slack(self, t: float) -> float:
         """Return the difference below which two times near `t` are the same."""
@@ -569,13 +579,14 @@ class MHE:
         bound = None
         if self.guaranteed is not None:
             first = float(solved.part("t")[0])
-            track = state.track or self.guaranteed.begin(state.t0, state.start[: self.stage.nx])
-            doubts = state.doubts
-            if not any(when > first for when, _ in doubts):
-                times, rows = state.measurements.arrays(t + self._slack(t))
-                doubts = self.guaranteed.incomplete(times, rows, first, t)
-            fields["track"], bound = self.guaranteed.after(track, first, t, cost, status, doubts)
-            fields["doubts"] = tuple(doubt for doubt in state.doubts if doubt[0] > edge)
+            times, rows = state.measurements.arrays(t + self._slack(t))
+            track = self.guaranteed.resume(state.track, state.t0, state.start[: self.stage.nx], state.t)
+            outside = () if track is state.track else self.guaranteed.outside(state.p)
+            known = (*state.doubts, *((np.inf, reason) for reason in outside))
+            doubts = self.guaranteed.current(known, times, first)
+            reasons = [reason for _, reason in doubts] or self.guaranteed.lacking(times, rows, first, t)
+            fields["track"], bound = self.guaranteed.after(track, first, t, cost, status, reasons)
+            fields["doubts"] = self.guaranteed.current(known, times, edge - slack)
         new = made(State, state.__dict__ | fields)
 
         def covariance() -> tuple[Array, int]:
@@ -766,9 +777,14 @@ class MHE:
 
         For times within the last horizon, as `trajectory`.
         """
+        t = finite_time(t, "trajectory_bound")
         if self.guaranteed is None or state.track is None or self.guaranteed.unmet:
             return None
-        level = self.guaranteed.bounds.at(state.track, finite_time(t, "trajectory_bound"))
+        if not max(state.t0, state.t - self.horizon) - self._slack(t) <= t <= state.t + self._slack(t):
+            raise NotEstimated(
+                f"trajectory_bound at t = {t:g} s: kept is the horizon before the last estimate at {state.t:g} s"
+            )
+        level = self.guaranteed.bounds.at(state.track, t)
         return float(np.sqrt(level)) if np.isfinite(level) else None
 
     def reference(self, state: State, t: float) -> Estimate:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import casadi as ca
 import numpy as np
 
 from ctmhe.certificates.certificate import DetectabilityCertificate
 from ctmhe.errors import InputError
+from ctmhe.estimators.guaranteed import measurement_noise
 from ctmhe.models.continuous import Model
 from ctmhe.simulation.run import Run
 from ctmhe.types import Array
@@ -55,6 +55,8 @@ def audit(run: Run, model: Model, certificate: DetectabilityCertificate, *, cand
         raise InputError("audit: the run's estimator had no certificate; build it with MHE(guarantee=Guarantee(...))")
     if data["x_true"].isnull().any():
         raise InputError("audit: the true state is not known (a replayed log, or a plant with other states)")
+    if data.attrs["holds"] not in ("zero", "point" if model.step else "zero"):
+        raise InputError(f"audit: outputs are held by hold={data.attrs['holds']!r}; it knows 'zero' only")
     truth = _Truth(run, model, certificate)
     solve_time, start = data["solve_time"].to_numpy(), data["window_start"].to_numpy()
     x_hat, x_prior = data["x_hat"].to_numpy(), data["x_prior"].to_numpy()
@@ -111,6 +113,8 @@ class _Truth:
             raise InputError(f"audit: the plant lacks a disturbance or input of the model: {error}") from None
         self.w, self.u = data["w"].to_numpy()[rows][:, order], data["u"].to_numpy()[rows][:, inputs]
         self.p = data["p_true"].to_numpy() if len(model.p) and "p_true" in data else np.asarray(model.p_start)
+        self.at_events = bool(data.attrs["records_at_events"])
+        self.recorded = np.isin(self.t.round(12), run.t.round(12))
         self.densities = self._densities()
 
     def _rate(self, x: Array, u: Array, w: Array) -> Array:
@@ -132,15 +136,22 @@ class _Truth:
         """Return |w|^2_Q at the start, middle and end of every slot (n, 3); one value a step in discrete time."""
         if self.step is not None:
             return np.einsum("ki,ij,kj->k", self.w, self.Q, self.w)[:-1]
-        noise, inverse = _noise(self.model)
-        found = np.empty((len(self.t) - 1, 3))
+        found = measurement_noise(self.model)
+        if found is None:
+            raise InputError(
+                f"audit: no disturbance of {self.model.name!r} stands for measurement noise alone in every output, "
+                "which has to make up for the measured signal being held between its records; give the model such noise"
+            )
+        noise, inverse = found
+        densities, held = np.empty((len(self.t) - 1, 3)), np.zeros(len(self.model.y))
         for k in range(len(self.t) - 1):
-            held = self._output(self.x[k], k)
+            if self.at_events or self.recorded[k]:
+                held = self._output(self.x[k], k)
             for j, t in enumerate((self.t[k], (self.t[k] + self.t[k + 1]) / 2, self.t[k + 1])):
                 w = self.w[k].copy()
                 w[noise] += inverse @ (held - self._output(self.state(t), k))
-                found[k, j] = _square(w, self.Q)
-        return found
+                densities[k, j] = _square(w, self.Q)
+        return densities
 
     def _output(self, x: Array, k: int) -> Array:
         return np.asarray(self.model.output(self.t[k], x, self.u[k], self.w[k], self.p)).ravel()
@@ -160,22 +171,3 @@ class _Truth:
             value = f0 * (1 - s) * (1 - 2 * s) + 4 * f1 * s * (1 - s) + f2 * s * (2 * s - 1)
             total += weight * value * eta ** ((b - self.t[:-1][used] - s * ends) / self.unit)
         return float(np.sum(total * (right - left)[used] / 6))
-
-
-def _noise(model: Model) -> tuple[Array, Array]:
-    """Return which entries of w enter outputs only, and the matrix that makes up for an output error with them."""
-    x, u, w, p = (np.asarray(getattr(model, key).nominal) for key in "xuwp")
-    kind: Any = ca.SX if model.dynamics.is_a("SXFunction") and model.output.is_a("SXFunction") else ca.MX
-    free = kind.sym("w", len(w))
-    moved = ca.jacobian(model.dynamics(0.0, x, u, free, p), free)
-    noise = np.array([i for i in range(len(w)) if moved[:, i].nnz() == 0], dtype=int)
-    D = np.asarray(
-        ca.DM(ca.Function("D", [free], [ca.densify(ca.jacobian(model.output(0.0, x, u, free, p), free))])(w))
-    )
-    D = D[:, noise]
-    if not len(noise) or np.linalg.matrix_rank(D) < len(model.y):
-        raise InputError(
-            f"audit: no disturbance of {model.name!r} stands for measurement noise alone in every output, which has to "
-            "make up for the measured signal being held between its records; give the model such noise"
-        )
-    return noise, np.linalg.pinv(D)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ctmhe.models.signals import Signals
+from ctmhe.simulation.channel import WholeSignal
 from ctmhe.simulation.run import FORMAT, Run
 from ctmhe.triggers.timing import tolerance
 from ctmhe.types import Array, Estimate
@@ -200,7 +201,15 @@ class Recorder:
             return {}
         bounds, P = self.guaranteed.bounds, self.guaranteed.bounds.certificate.P_lower
         about = f"{bounds.certificate.method}, {'proof' if bounds.certificate.rigorous else 'evidence'}"
-        return {"certificate": about, "P_lower": P.reshape(-1), "domain_level": bounds.cap, "wait_limit": bounds.limit}
+        channel = getattr(self.loop.channel, "channel", self.loop.channel)
+        return {
+            "certificate": about,
+            "P_lower": P.reshape(-1),
+            "domain_level": bounds.cap,
+            "wait_limit": bounds.limit,
+            "holds": ", ".join(sorted(set(self.loop.mhe.hold.values()))),
+            "records_at_events": int(isinstance(channel, WholeSignal)),
+        }
 
     def _location(self) -> str:
         """Return in words how the times of events were found."""

@@ -63,7 +63,12 @@ class Certified(Or):
         if wait is None:
             wait = 0.9 * self.limit
             if certificate.step is not None:
-                wait = max(np.floor(wait / certificate.step), 1.0) * certificate.step
+                wait = np.floor(wait / certificate.step) * certificate.step
+                if not wait:
+                    raise InputError(
+                        f"Certified: with a horizon of {self.horizon:g} s not even a wait of one step is short enough; "
+                        f"lengthen it, or solve at every step without this policy (Remark 3.7)"
+                    )
         self.wait = positive(wait, "Certified: wait")
         if self.wait >= self.limit:
             raise InputError(
@@ -98,6 +103,8 @@ class BoundSelfTriggered(Trigger):
     plant does inside the domain. The comparison lemma gives r(t_i + s) <= `growth.ahead(b, s)`, which reaches `size`
     no earlier than at `growth.time_to(size, b)`: that is when the next sample is taken. Until then
     |x_online - x|_P_lower <= |x_online - x|_P_upper < size.
+
+    It needs the prediction to stay inside the domain, as the plant does: the growth is that of the domain.
 
     Where the bound after a sample is not below `size`, or there is none, the next sample follows after `shortest`: the
     wanted level cannot be promised yet. `longest` keeps (3.29), as in `Certified`.

@@ -11,11 +11,11 @@ from ctmhe.certificates.certificate import DetectabilityCertificate
 from ctmhe.certificates.guarantee import Guarantee
 from ctmhe.errors import InputError
 from ctmhe.estimators import MHE
-from ctmhe.models import DiscreteModel
+from ctmhe.models import ContinuousModel, DiscreteModel
 from ctmhe.models.library import batch_reactor
 from ctmhe.transcription import RK4
 from ctmhe.types import Bounds, DiscountedCost, Measurement
-from tests.conftest import P_REACTOR, linear_model
+from tests.conftest import P_REACTOR
 
 MODEL = batch_reactor()
 CERTIFICATE = DetectabilityCertificate(
@@ -197,8 +197,14 @@ def test_missing_values_cost_the_bound():
     state, _ = observed(mhe, until=1.0)
     state, estimate = mhe.estimate(mhe.observe(state, Measurement(1.0, [np.nan])), 1.0)
     assert estimate.bound.reasons == ("no output has a value at t = 1 s",)
-    model = linear_model([[-1.0]], [[1.0]], [[1.0], [1.0]])
-    certificate = DetectabilityCertificate([[1.0]], [[1.0]], [[1.0]], np.eye(2), np.exp(-1.0))
+    model = ContinuousModel(
+        lambda t, x, u, w, p: [-x[0] + w[0]],
+        lambda t, x, u, w, p: [x[0] + w[1], x[0] + w[2]],
+        x=("x",),
+        w=("w", "v0", "v1"),
+        y=("y0", "y1"),
+    )
+    certificate = DetectabilityCertificate([[1.0]], [[1.0]], np.eye(3), np.eye(2), np.exp(-1.0))
     pair = MHE(
         model,
         horizon=2.0,
