@@ -117,10 +117,18 @@ def certify_detectability(
         method=search.cover.method,
         rigorous=search.cover.rigorous,
         margin=float(values[0]),
-        domain=domain or model.bounds,
+        domain=_where(increments, domain or model.bounds),
         worst=worst,
         notes=tuple(notes),
     )
+
+
+def _where(increments: Increments, domain: Bounds) -> Bounds:
+    """Return the domain without bounds of the disturbances on which no Jacobian depends: it holds for all of them."""
+    names, place = increments.model.w.names, increments.place["w"]
+    moving = [i for i in range(len(names)) if place.start + i in increments.varying]
+    sides = {names[i]: (increments.lower[place][i], increments.upper[place][i]) for i in moving}
+    return replace(domain, w=sides or None)
 
 
 def _cover(increments: Increments, jacobians: Cover | Mapping[str, Any] | None) -> Cover:

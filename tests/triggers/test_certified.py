@@ -28,7 +28,7 @@ WELL = ContinuousModel(
 )
 # 2 e (-e - (x1^3 - x2^3) + dw) <= -2 e^2 + e^2 + dw^2: eta = 1 / e, P = 1, Q = 1; noise and output may weigh anything
 WELL_CERTIFICATE = DetectabilityCertificate(
-    [[1.0]], [[1.0]], np.diag([1.0, 1.0]), [[1.0]], np.exp(-RATE), domain=WELL.bounds, rigorous=True
+    [[1.0]], [[1.0]], np.diag([1.0, 1.0]), [[1.0]], np.exp(-RATE), domain=Bounds(x=(-2, 2)), rigorous=True
 )
 
 
