@@ -135,3 +135,33 @@ def test_bounds_along_the_trajectory_grow_to_the_left():
     for end, before in pairwise(reversed(track.ends)):
         middle = (end + before) / 2
         assert bounds.at(track, middle) == pytest.approx(bounds.at(track, end) / bounds.fade(end - middle))
+
+
+def test_long_runs_end_in_no_underflow():
+    """A breach after thousands of horizons is as good as one after ten."""
+    bounds = bounds_of(cap=20.0)
+    track = Track(0.0, 5.0)
+    for k in range(1, 40):
+        t = 5000.0 + 0.3 * k
+        track, bound = bounds.after(track, t - 2.5, t, 0.0, ("lost",) if k == 20 else ())
+    assert bound.level is not None and bound.level < 20.0
+
+
+def test_gaps_that_drift_are_not_equal():
+    """Gaps within the tolerance of each other whose windows do not start at solves have no sharper theorem."""
+    bounds = bounds_of(horizon=2.0, slack=1e-3)
+    track, t = Track(0.0, 5.0), 0.0
+    for _ in range(60):
+        t += 0.1 + 0.9e-3
+        track, _bound = bounds.after(track, max(t - 2.0, 0.0), t, 0.0)
+    assert np.isnan(track.period)
+
+
+def test_a_rate_that_rounds_to_one_guarantees_nothing():
+    """The wait is below its limit by rounding only."""
+    eta = 0.7071067811865475
+    certificate = DetectabilityCertificate(np.eye(1), np.eye(1), np.eye(1), np.eye(1), eta, step=1.0)
+    bounds, track = WindowBounds(certificate, 6.0, 1.0, cap=10.0), Track(0.0, 10.0)
+    for t in (2.0, 3.0, 5.0):
+        track, bound = bounds.after(track, 0.0, t, 0.0)
+    assert bound.level is not None

@@ -230,6 +230,68 @@ def test_missing_values_cost_the_bound():
     assert pair.estimate(whole, 0.2)[1].bound.size is not None
 
 
+def test_stretches_without_data_cost_the_bound():
+    """Before the first record, and where a value has been held for longer than `hold_limit`, nothing is known."""
+    late = reactor()
+    state = late.observe(late.init(x=[0.1, 4.5]), Measurement(0.2, [4.0]))
+    assert "from the window's start at 0 s on" in str(late.estimate(state, 0.5)[1].bound)
+    forgetful = reactor(hold_limit=0.3)
+    state = forgetful.observe(forgetful.init(x=[0.1, 4.5]), Measurement(0.0, [4.0]))
+    assert forgetful.estimate(state, 0.3)[1].bound.size is not None
+    assert "nothing is measured for 0.5 s" in str(forgetful.estimate(state, 0.5)[1].bound)
+
+
+def test_a_doubt_at_the_start_counts():
+    """A lost first message concerns every window that starts there."""
+    mhe = reactor()
+    state = mhe.doubt(mhe.init(x=[0.1, 4.5]), 0.0, "the first message was lost")
+    state = mhe.observe(state, Measurement(0.0, [4.0]))
+    assert mhe.estimate(state, 0.1)[1].bound.reasons == ("the first message was lost",)
+    with pytest.raises(InputError, match="doubt: expected a time"):
+        mhe.doubt(state, np.nan, "no time")
+
+
+def test_what_comes_late_takes_back_what_was_solved_without_it():
+    """Pieces solved before a late record or doubt are bounded by the domain only, and the theorem starts anew."""
+    mhe = reactor(level=1e-3)
+    state, _ = observed(mhe, until=3.0)
+    cap = np.sqrt(mhe.guaranteed.bounds.cap)
+    last = state.t
+    assert mhe.trajectory_bound(state, last) < 0.9 * cap
+    for later in (mhe.observe(state, Measurement(last - 0.025, [3.9])), mhe.doubt(state, last - 0.3, "wrong")):
+        assert mhe.trajectory_bound(later, last) == pytest.approx(cap)
+        assert mhe.trajectory_bound(later, last - 1.0) < 1.2 * cap and later.track.since == last
+
+
+def test_another_configuration_starts_its_bounds_anew(tmp_path):
+    """Levels of other weights, or of no guarantee, say nothing: the domain bounds what was estimated before."""
+    scaled = DiscountedCost(P=100 * COST.P, Q=100 * COST.Q, R=100 * COST.R, eta=0.4)
+    for other in (reactor(guarantee=None), reactor(cost=scaled)):
+        state, _ = observed(other, until=2.5)
+        other.save(state, tmp_path / "state.npz")
+        mhe = reactor()
+        state, estimate = mhe.estimate(mhe.load(tmp_path / "state.npz"), 2.5)
+        assert estimate.bound.level <= mhe.guaranteed.bounds.cap * (1 + 1e-9)
+        assert mhe.trajectory_bound(state, 1.0) == pytest.approx(np.sqrt(mhe.guaranteed.bounds.cap))
+
+
+def test_a_model_without_noise_has_no_guarantee():
+    """Holding the output between records has to be somebody's disturbance."""
+    model = batch_reactor(noise=False)
+    certificate = replace(CERTIFICATE, Q=np.diag([1e3, 1e3]))
+    mhe = MHE(
+        model,
+        horizon=2.0,
+        interval=0.05,
+        integrator=RK4(0.05),
+        cost=DiscountedCost.from_certificate(certificate),
+        bounds=replace(MODEL.bounds, w=None),
+        hold="zero",
+        guarantee=Guarantee(certificate, 0.1),
+    )
+    assert "no measurement noise in every output" in " ".join(mhe.guaranteed.unmet)
+
+
 def test_steps_without_a_measurement_cost_the_bound():
     """A discrete model's windows need the output of every step."""
     model = DiscreteModel(
