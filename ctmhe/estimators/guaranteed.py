@@ -156,8 +156,9 @@ def measurement_noise(model: Model) -> tuple[Array, Array] | None:
 
 
 def _spread(value: object, n: int) -> object:
-    scalar = np.ndim(value) == 0 and isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
-    return np.full(n, float(value)) if scalar else value  # type: ignore[arg-type]
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
+        return value
+    return np.full(n, float(value))
 
 
 def _scaled(own: DetectabilityCertificate, mhe: MHE) -> tuple[DetectabilityCertificate, list[str]]:
