@@ -5,6 +5,7 @@ from ctmhe.models.library.cascaded_tanks import cascaded_tanks
 from ctmhe.models.library.chua import chua, chua_discrete
 from ctmhe.models.library.cstr import cstr, cstr_steady_states
 from ctmhe.models.library.quadrotor import hover_speed, quadrotor
+from ctmhe.models.library.random_stable import random_stable
 from ctmhe.models.library.three_species import three_species, three_species_discrete
 from ctmhe.models.library.van_der_pol import van_der_pol
 
@@ -17,6 +18,7 @@ __all__ = [
     "cstr_steady_states",
     "hover_speed",
     "quadrotor",
+    "random_stable",
     "three_species",
     "three_species_discrete",
     "van_der_pol",
