@@ -1,4 +1,4 @@
-"""Thesis Table 6.2: large linear systems offline; the full problem, its approximation in blocks, and Kalman smoothing."""
+"""Thesis Table 6.2: large linear systems offline; the full problem, its blocks, and Kalman smoothing."""
 
 from __future__ import annotations
 
@@ -149,10 +149,11 @@ def _std(values: Array) -> float:
 
 
 COMMENT = (
-    "One random system each is published, drawn by MATLAB's drss; ours are drawn by a generator of the same kind, so "
-    "levels differ and orders compare: full and AE agree in J and SSE, both smoothers and filters are behind. The "
-    "sinusoids of d and u are not printed. Our full problem is a block-tridiagonal Cholesky factorisation, O(T), so it "
-    "takes about as long as the AE, and n = 120, which could not be solved as published, is solved. J of the published "
-    "Kalman filter is hundreds of times ours, of the size that its prediction has (the row one step ahead). The FIS would be "
-    "optimal with a prior that is right: it starts from a random mean with covariance I while x(0) = 0."
+    "One random system each is published, drawn by MATLAB's drss; ours are drawn by a generator of the same kind, "
+    "so levels differ and orders compare: full and AE agree in J and SSE, smoother and filter are behind. The "
+    "sinusoids of d and u are not printed. Our full problem is a block-tridiagonal Cholesky factorisation, O(T), so "
+    "it takes about as long as the AE, and n = 120, which could not be solved as published, is solved. J of the "
+    "published Kalman filter is hundreds of times ours, of the size that its prediction has (the row one step "
+    "ahead). The smoother would be optimal with a prior that is right: it starts from a random mean with covariance "
+    "I while x(0) = 0."
 )
