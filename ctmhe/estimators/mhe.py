@@ -34,7 +34,7 @@ from ctmhe.solvers.verification import verify as check
 from ctmhe.transcription.assembly import Assembly, Records, hold_kinds
 from ctmhe.transcription.grid import Mesh, plain_mesh, same_time
 from ctmhe.transcription.integrators import Integrator, StepMap
-from ctmhe.transcription.problem import Window
+from ctmhe.transcription.problem import Guess, Window
 from ctmhe.transcription.solved import Layout, Solved
 from ctmhe.transcription.stage import StageFunction
 from ctmhe.types import (
@@ -529,6 +529,23 @@ class MHE:
                 f"control(state, Input(t={start:g}, u=...)) first"
             )
         return times, rows
+
+    def solve_window(
+        self, window: Window, guesses: list[tuple[str, Callable[[], Guess]]]
+    ) -> tuple[Solved | None, float, Status]:
+        """Solve any window of this estimator's assembly: its solution (None when no solver gave numbers), cost, status.
+
+        Parameters
+        ----------
+        window : Window
+        guesses : list of (name, function returning a Guess)
+            Where to start, best first.
+        """
+        notes = () if window.L_y.any() else ("no measurement in window",)
+        solution, status = climb(window, self._solver, lambda: self._reference, guesses, notes)
+        if solution is None:
+            return None, float("nan"), status
+        return self._packed(window, solution), solution.cost, status
 
     def _packed(self, window: Window, solution: Solution) -> Solved:
         """Return a solver's result as the blocks that the core would have written."""
