@@ -249,6 +249,13 @@ class MHE:
         kind = f"{type(self.integrator).__name__}, interval {self.interval:g} s"
         return f"MHE of {self.model.name!r}: horizon {self.horizon:g} s, {kind}, eta {self.cost.eta:g}"
 
+    def changed(self, **configuration: Any) -> MHE:
+        """Return this estimator with some arguments changed."""
+        unknown = [name for name in configuration if name not in self._configuration]
+        if unknown:
+            raise InputError(f"MHE has no argument {unknown[0]!r}. Known: {', '.join(self._configuration)}")
+        return _rebuild(self._configuration | configuration)
+
     def check_wait(self, wait: float) -> None:
         """Raise `InputError` unless a declared longest wait between estimates is shorter than the horizon (3.19)."""
         if not wait < self.horizon:
