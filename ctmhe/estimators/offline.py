@@ -191,8 +191,8 @@ def records_of(mhe: MHE, log: MeasurementLog) -> Records:
     known = [name for name in log.outputs if name in model.y.names]
     if not known:
         raise InputError(
-            f"the log has outputs {', '.join(log.outputs)}, the model {', '.join(model.y.names)}: name the log's columns "
-            "like the model's outputs"
+            f"the log has outputs {', '.join(log.outputs)}, the model {', '.join(model.y.names)}: name the log's "
+            "columns like the model's outputs"
         )
     missing = [name for name in model.u.names if name not in log.inputs]
     if missing:
@@ -253,14 +253,16 @@ def _given(mhe: MHE, window: Window, guess: Callable[[float], Any], p: Array) ->
     return Guess.of(x, np.zeros((len(window.mesh), mhe.stage.nw)), p, mhe.stage.ny)
 
 
+def _lost(error: Exception) -> tuple[None, float, Status, float]:
+    """Return what is left of a block that raised, or whose process died."""
+    return None, np.nan, Status(Outcome.PREDICTED, False, rungs=(f"{type(error).__name__}: {error}",)), np.nan
+
+
 def _joined(mhe: MHE, blocks: list[Block], answers: list[Any], wanted: Array | None, p: Array) -> OfflineEstimate:
     """Put the kept parts together."""
     reports, times, states, trajectory = [], [], [], None
     for block, answer in zip(blocks, answers, strict=True):
-        if isinstance(answer, Exception):
-            told = f"{type(answer).__name__}: {answer}"
-            answer = None, np.nan, Status(Outcome.PREDICTED, False, rungs=(told,)), np.nan
-        trajectory, cost, status, seconds = answer
+        trajectory, cost, status, seconds = _lost(answer) if isinstance(answer, Exception) else answer
         failed = "" if trajectory is not None else "; ".join(status.rungs) or "no solver gave numbers"
         reports.append(
             BlockReport(block.start, block.stop, block.keep_from, block.keep_to, cost, seconds, status, failed)

@@ -157,8 +157,8 @@ def infinite_horizon(
     start, end = float(log.t[0]), float(log.t[-1])
     if not 0 < margin < (end - start) / 2:
         raise InputError(
-            f"infinite_horizon: margin = {margin!r} s; it must be positive and leave something of the {end - start:g} s "
-            "of the record, margin < half of it"
+            f"infinite_horizon: margin = {margin!r} s; it must be positive and less than half of the record's "
+            f"{end - start:g} s"
         )
     bare = _without_ends(mhe)
     far = estimate_offline(bare, log, guess=guess, p=p, **options)
@@ -224,8 +224,8 @@ def _at_nodes(mhe: MHE, nodes: Array, t: Array, x: Array) -> Array:
     missing = (np.abs(t[i] - nodes) > 2 * slack) | ~np.isfinite(x[i]).all(axis=1)
     if missing.any():
         raise InputError(
-            f"there is no estimate at t = {nodes[missing][0]:g} s, a node of the transcription (cell edge, sample or input "
-            f"switch every {mhe.interval:g} s at most); {missing.sum()} of {len(nodes)} nodes lack one"
+            f"there is no estimate at t = {nodes[missing][0]:g} s, a node of the transcription (a cell edge, sample or "
+            f"input switch); {missing.sum()} of {len(nodes)} nodes lack one"
         )
     return x[i]
 

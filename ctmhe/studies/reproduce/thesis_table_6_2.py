@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ctmhe.estimators.blocks import in_parallel
 from ctmhe.estimators.linear import LinearProblem, rauch_tung_striebel, solve_blocks, solve_linear
 from ctmhe.models.library import random_stable
+from ctmhe.studies.reproduce._offline import all_of, cell
 from ctmhe.types import Array
 
 STEPS, INPUTS, BLOCK, DELTA = 4803, 30, 150, 70
@@ -109,16 +109,13 @@ def reproduce(
     """
     keep = 2 * DELTA + 1
     tasks = [partial(one_system, n, p, seed, steps, BLOCK, keep) for n, p in sizes for seed in range(seeds)]
-    answers = in_parallel(tasks, workers=workers)
-    for answer in answers:
-        if isinstance(answer, Exception):
-            raise answer
+    answers = all_of(tasks, workers)
     table, excess = [], []
     for i, (n, p) in enumerate(sizes):
         runs = answers[i * seeds : (i + 1) * seeds]
         for name in runs[0]:
             values = np.array([run[name] for run in runs])
-            cells = [{"mean": float(column.mean()), "std": _std(column)} for column in values.T]
+            cells = [cell(column) for column in values.T]
             table.append(dict(zip(HEADS, (n, p, name, *cells), strict=True)))
         ratio = max(run["AE"][0] / run["full"][0] - 1 for run in runs)
         excess.append({"n": n, "largest relative excess of J": ratio})
@@ -142,10 +139,6 @@ def reproduce(
         },
         "comment": COMMENT,
     }
-
-
-def _std(values: Array) -> float:
-    return float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
 
 
 COMMENT = (
