@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -58,7 +59,7 @@ def reactor_record(until: float = 6.0) -> tuple[MeasurementLog, np.ndarray]:
     t = np.concatenate([[0.0], np.cumsum(rng.uniform(0.05, 0.25, 100))])
     t = np.append(t[t < until - 0.01], until)
     state, x = mhe.init(x=[3.0, 1.0]), [np.array([3.0, 1.0])]
-    for a, b in zip(t[:-1], t[1:], strict=True):
+    for a, b in pairwise(t):
         x.append(mhe.propagate(state, a, b, x[-1], np.empty(0)))
     x = np.array(x)
     y = x.sum(axis=1) + rng.uniform(-0.05, 0.05, len(t))
@@ -196,7 +197,7 @@ def test_in_continuous_time_the_performance_of_the_solution_is_its_cost():
 
 
 def test_no_estimates_have_less_regret_than_the_best_with_both_ends_fixed():
-    """The benchmark restricted to a stretch is optimal between its own ends: regret of others with these is positive."""
+    """The benchmark is optimal between its own ends: the regret of others with these ends is positive."""
     log, _ = linear_record()
     mhe = linear_mhe(P=0.0)
     best = infinite_horizon(mhe, log, margin=6.0, guess=np.ones(3))
@@ -253,7 +254,7 @@ def test_what_does_not_fit_is_named():
         estimate_offline(joint, reactor_record()[0], guess=[3.0, 1.0], block=2.0)
     with pytest.raises(InputError, match="margin"):
         infinite_horizon(mhe, log, margin=15.0, guess=np.ones(3))
-    with pytest.raises(InputError, match="no estimate at t = 0.5"):
+    with pytest.raises(InputError, match=r"no estimate at t = 0\.5"):
         performance(mhe, log, log.t[::2], np.zeros((31, 3)))
     stiff = ContinuousModel(
         lambda t, x, u, w, p: [x[1], w[0]], lambda t, x, u, w, p: x[0], x=("q", "v"), w="a", y="z", name="mass"
