@@ -98,11 +98,11 @@ def test_a_delay_pays():
     y = x @ C.T + rng.normal(size=(301, 1)) / np.sqrt(2.0)
     log = MeasurementLog(np.arange(301) * 0.5, y, ("y",), np.zeros((301, 1)), ("u",))
     errors = []
-    for steps in (0, 1, 3, 6):
+    for steps in (0, 1, 3):
         found = stepped(linear_mhe().changed(delay=steps * 0.5), log, guess=np.zeros(3))
         delayed = np.array([estimate.delayed.x for estimate in found[steps:]])
         errors.append(np.sum((delayed - x[: 301 - steps])[50:290] ** 2))
-    assert errors[3] < errors[2] < errors[1] < 0.95 * errors[0]
+    assert errors[2] < errors[1] < 0.95 * errors[0]
 
 
 def test_a_run_tells_the_delayed_error():
