@@ -16,7 +16,7 @@ from ctmhe.errors import InputError
 from ctmhe.estimators.blocks import Block, blocks_of, in_parallel
 from ctmhe.estimators.guesses import shifted_guess
 from ctmhe.estimators.mhe import MHE
-from ctmhe.estimators.priors import trajectory_at
+from ctmhe.estimators.trajectories import trajectory_at
 from ctmhe.transcription.assembly import Records
 from ctmhe.transcription.problem import Guess, Window
 from ctmhe.types import Array, Outcome, Status, Trajectory, frozen

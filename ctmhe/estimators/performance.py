@@ -162,7 +162,7 @@ def infinite_horizon(
         )
     bare = _without_ends(mhe)
     far = estimate_offline(bare, log, guess=guess, p=p, **options)
-    slack = mhe._slack(end)
+    slack = mhe.slack(end)
     middle = (far.t >= start + margin - slack) & (far.t <= end - margin + slack)
     t, x = far.t[middle], far.x[middle]
     rows = (log.t >= start + margin / 2 - slack) & (log.t <= end - margin / 2 + slack)
@@ -209,7 +209,7 @@ def _window(mhe: MHE, log: MeasurementLog, t: Array, p: Any) -> Window:
     )
     records = records_of(mhe, log)
     end = float(t[-1])
-    last = int(np.searchsorted(records.y_times, end + mhe._slack(end), side="right"))
+    last = int(np.searchsorted(records.y_times, end + mhe.slack(end), side="right"))
     seen = Records(records.y_times[:last], records.y[:last], records.u_times, records.u)
     prior = np.concatenate([np.zeros(mhe.stage.nx), parameters])
     return assembly.window(float(t[0]), end, seen, prior, growing=False)
@@ -219,7 +219,7 @@ def _at_nodes(mhe: MHE, nodes: Array, t: Array, x: Array) -> Array:
     """Return the estimates at the nodes."""
     if len(t) != len(x) or (np.diff(t) < 0).any():
         raise InputError(f"estimates: expected increasing times (n,) and states (n, nx), got {t.shape} and {x.shape}")
-    slack = mhe._slack(float(nodes[-1]))
+    slack = mhe.slack(float(nodes[-1]))
     i = np.clip(np.searchsorted(t, nodes - slack), 0, len(t) - 1)
     missing = (np.abs(t[i] - nodes) > 2 * slack) | ~np.isfinite(x[i]).all(axis=1)
     if missing.any():
