@@ -63,7 +63,7 @@ class KalmanWeight:
         nothing = np.zeros(len(mhe.model.u)) if not len(state.inputs) else None
         if mhe.stage.nw and np.any(_output_jacobian(mhe, state, state.t0, state.x, nothing)[:, mhe.stage.nx :]):
             raise InputError("KalmanWeight: a disturbance enters the outputs; let the residual be the noise instead")
-        row = np.concatenate([state.x, covariance.reshape(-1)])
+        row = np.concatenate([state.x, covariance.reshape(-1), covariance.reshape(-1)])
         before = float(np.nextafter(state.t0, -np.inf))  # what is measured at t0 is still to come
         return {**prior_of(self.rule).begin(mhe, state), COVARIANCES: Log.of([before], row, len(row))}
 
@@ -72,14 +72,14 @@ class KalmanWeight:
         anchor = prior_of(self.rule).at(mhe, state, start, growing)
         if anchor is None or growing:
             return anchor
-        slack = mhe.slack(start)
-        # a discrete window counts the measurement at its start itself; in continuous time it lies before the window
-        until = start - slack if mhe.model.step is not None else start + slack
-        times, rows = state.memory[COVARIANCES].arrays(until)
+        times, rows = state.memory[COVARIANCES].arrays(start + mhe.slack(start))
         if not len(times):
             return anchor
-        x, covariance = _split(mhe, rows[-1])
-        covariance = mhe.propagate_covariance(state, float(times[-1]), start, x, state.p, covariance)
+        x, before, covariance = _split(mhe, rows[-1])
+        if times[-1] < start - mhe.slack(start):
+            covariance = mhe.propagate_covariance(state, float(times[-1]), start, x, state.p, covariance)
+        elif mhe.model.step is not None:
+            covariance = before  # a discrete window counts the measurement at its start itself
         return replace(anchor, weight=np.linalg.inv(covariance))
 
     def after(self, mhe: MHE, state: State, solved: Solved) -> Memory:
@@ -88,23 +88,25 @@ class KalmanWeight:
         log = state.memory[COVARIANCES].drop_after(state.since)
         times, rows = state.measurements.arrays(state.t + mhe.slack(state.t))
         last, row = (values[-1] for values in log.arrays())
-        x, covariance = _split(mhe, row)
+        x, _, covariance = _split(mhe, row)
         for t, y in zip(times.tolist(), rows, strict=True):
             if t <= last:
                 continue
-            covariance = mhe.propagate_covariance(state, max(float(last), state.t0), t, x, state.p, covariance)
+            before = mhe.propagate_covariance(state, max(float(last), state.t0), t, x, state.p, covariance)
             estimated = path_at(mhe.stage, state.path, t, mhe.slack(t))
             x = state.x if estimated is None else estimated[: mhe.stage.nx]
-            covariance = _updated(mhe, state, t, x, covariance, np.isfinite(y))
-            log, last = log.put(t, np.concatenate([x, covariance.reshape(-1)])), t
+            covariance = _updated(mhe, state, t, x, before, np.isfinite(y))
+            log, last = log.put(t, np.concatenate([x, before.reshape(-1), covariance.reshape(-1)])), t
         # the last one before the next window's start still counts
         log = log.drop_before(state.t - mhe.horizon - mhe.interval, keep_holding=True)
         return {**memory, COVARIANCES: log}
 
 
-def _split(mhe: MHE, row: Array) -> tuple[Array, Array]:
+def _split(mhe: MHE, row: Array) -> tuple[Array, Array, Array]:
+    """Return the estimate at a measurement, and the covariance before and after it."""
     nx = mhe.stage.nx
-    return row[:nx], row[nx:].reshape(nx, nx)
+    before, after = row[nx:].reshape(2, nx, nx)
+    return row[:nx], before, after
 
 
 def _output_jacobian(mhe: MHE, state: State, t: float, x: Array, u: Array | None = None) -> Array:
