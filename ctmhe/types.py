@@ -388,6 +388,22 @@ class ErrorBound:
 
 
 @dataclass(frozen=True, eq=False)
+class Delayed:
+    """The estimate of a past instant, out of the solution of a later window (thesis 6.47).
+
+    Attributes
+    ----------
+    t : float
+        Time that it is of, seconds.
+    x : array (nx,)
+        State, model units.
+    """
+
+    t: float
+    x: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Estimate:
     """The result of one solve, at time `t`.
 
@@ -410,6 +426,9 @@ class Estimate:
         Wall-clock time of the call.
     bound : ErrorBound or None
         What is guaranteed of x; None for an estimator without a `Guarantee`.
+    delayed : Delayed or None
+        The estimate of t - delay from this window, for an estimator with a `delay` (6.47), (6.76); None without, and
+        until the delay has passed. No bound is claimed for it.
     """
 
     t: float
@@ -423,6 +442,7 @@ class Estimate:
     seconds: float = field(compare=False, default=float("nan"))
     _covariance: Callable[[], tuple[Array, int]] | None = field(default=None, repr=False)
     bound: ErrorBound | None = field(default=None, repr=False)
+    delayed: Delayed | None = field(default=None, repr=False)
 
     @cached_property
     def trajectory(self) -> Trajectory:

@@ -35,12 +35,13 @@ from ctmhe.solvers.verification import verify as check
 from ctmhe.transcription.assembly import Assembly, Records, hold_kinds
 from ctmhe.transcription.grid import Mesh, plain_mesh, same_time
 from ctmhe.transcription.integrators import Integrator, StepMap
-from ctmhe.transcription.problem import Window
+from ctmhe.transcription.problem import Guess, Window
 from ctmhe.transcription.solved import Layout, Solved
 from ctmhe.transcription.stage import StageFunction
 from ctmhe.types import (
     Array,
     Bounds,
+    Delayed,
     DiscountedCost,
     Estimate,
     Input,
@@ -113,6 +114,9 @@ class MHE:
         How the known input runs between its samples.
     filtering : bool
         `DiscreteModel` only: count the measurement at the estimate's own time.
+    delay : float, optional
+        Seconds, at most the horizon: every estimate then also has the state of that long ago, `Estimate.delayed`, which
+        knows what was measured since (6.47), (6.76). A multiple of the step for a `DiscreteModel`.
     longest_wait : float, optional
         The longest wait between estimates, if declared; must be shorter than the horizon (3.19).
     guarantee : Guarantee, optional
@@ -140,8 +144,8 @@ class MHE:
     Raises
     ------
     InputError
-        For lengths that are not positive, weights and bounds that do not fit, unknown names, and a declared wait that
-        is not shorter than the horizon.
+        For lengths that are not positive, weights and bounds that do not fit, unknown names, a delay that is longer
+        than the horizon, and a declared wait that is not shorter.
     """
 
     def __init__(
@@ -158,6 +162,7 @@ class MHE:
         hold_limit: float | None = None,
         input_hold: str = "zero",
         filtering: bool = False,
+        delay: float | None = None,
         longest_wait: float | None = None,
         guarantee: Guarantee | None = None,
         solver: str = "gauss-newton",
@@ -205,6 +210,7 @@ class MHE:
         self.longest_wait = longest_wait
         if longest_wait is not None:
             self.check_wait(positive("longest_wait", longest_wait, "seconds"))
+        self.delay = None if delay is None else self._checked_delay(delay)
         if solver not in SOLVERS:
             raise InputError(f"solver must be one of {', '.join(SOLVERS)}, got {solver!r}")
         self.hold_limit = self.horizon if hold_limit is None else positive("hold_limit", hold_limit, "seconds")
@@ -257,6 +263,26 @@ class MHE:
     def __repr__(self) -> str:
         kind = f"{type(self.integrator).__name__}, interval {self.interval:g} s"
         return f"MHE of {self.model.name!r}: horizon {self.horizon:g} s, {kind}, eta {self.cost.eta:g}"
+
+    def _checked_delay(self, delay: Any) -> float:
+        if delay != 0:
+            delay = positive("delay", delay, "seconds")
+        if delay > self.horizon * (1 + 1e-9):
+            raise InputError(
+                f"the delay of {delay:g} s is longer than the horizon of {self.horizon:g} s: no window reaches back to "
+                "the state that is asked for. Lengthen the horizon, or wait less; half the horizon is the most of use"
+            )
+        step = self.model.step
+        if step is not None and abs(delay - round(delay / step) * step) > 1e-6 * step:
+            raise InputError(f"the delay of {delay:g} s is not a multiple of the discrete model's step {step:g} s")
+        return float(delay)
+
+    def changed(self, **configuration: Any) -> MHE:
+        """Return this estimator with some arguments changed."""
+        unknown = [name for name in configuration if name not in self._configuration]
+        if unknown:
+            raise InputError(f"MHE has no argument {unknown[0]!r}. Known: {', '.join(self._configuration)}")
+        return _rebuild(self._configuration | configuration)
 
     def check_wait(self, wait: float) -> None:
         """Raise `InputError` unless a declared longest wait between estimates is shorter than the horizon (3.19)."""
@@ -558,6 +584,23 @@ class MHE:
             )
         return times, rows
 
+    def solve_window(
+        self, window: Window, guesses: list[tuple[str, Callable[[], Guess]]]
+    ) -> tuple[Solved | None, float, Status]:
+        """Solve any window of this estimator's assembly: its solution (None when no solver gave numbers), cost, status.
+
+        Parameters
+        ----------
+        window : Window
+        guesses : list of (name, function returning a Guess)
+            Where to start, best first.
+        """
+        notes = () if window.L_y.any() else ("no measurement in window",)
+        solution, status = climb(window, self._solver, lambda: self._reference, guesses, notes)
+        if solution is None:
+            return None, float("nan"), status
+        return self._packed(window, solution), solution.cost, status
+
     def _packed(self, window: Window, solution: Solution) -> Solved:
         """Return a solver's result as the blocks that the core would have written."""
         point = solution.point
@@ -628,8 +671,18 @@ class MHE:
         spread = None if status.outcome is Outcome.PREDICTED else covariance
         seconds = self.clock() - began
         fields = {"t": t, "x": x, "p": p, "w": w, "y": y, "cost": cost, "status": status, "_solved": solved,
-                  "seconds": seconds, "_covariance": spread, "bound": bound}  # fmt: skip
+                  "seconds": seconds, "_covariance": spread, "bound": bound,
+                  "delayed": None if self.delay is None else self._delayed(state.t0, t, solved)}  # fmt: skip
         return new, made(Estimate, fields)
+
+    def _delayed(self, t0: float, t: float, solved: Solved) -> Delayed | None:
+        """Return the window's state of `delay` seconds ago (6.47), None where that lies before the start."""
+        assert self.delay is not None
+        past = t - self.delay
+        if past < t0 - self.slack(t):
+            return None
+        past = max(past, t0)
+        return made(Delayed, {"t": past, "x": frozen(trajectory_at(self.stage, solved.trajectory, past))})
 
     def propagate(self, state: State, t0: float, t1: float, x: Array, p: Array) -> Array:
         """Return the state at `t1` from `x` (nx,) at `t0`, without disturbance, under the inputs that `state` knows.
@@ -780,7 +833,8 @@ class MHE:
         if state.window is None:
             raise NotEstimated(f"smooth at t = {t:g} s: the last window covers no estimate yet")
         last = state.window.trajectory
-        if not last.t[0] <= t <= last.t[-1]:
+        slack = self.slack(t)
+        if not last.t[0] - slack <= t <= last.t[-1] + slack:
             raise NotEstimated(f"smooth at t = {t:g} s: the last window covers [{last.t[0]:g}, {last.t[-1]:g}] s")
         return frozen(trajectory_at(self.stage, last, t))
 

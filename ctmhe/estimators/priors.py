@@ -152,6 +152,8 @@ class Turnpike:
     def after(self, mhe: MHE, state: State, solved: Solved) -> Memory:
         """See `Prior`."""
         last, lag, slack = solved.trajectory, mhe.horizon / 2, mhe.slack(state.t)
+        if mhe.model.step is not None and np.isfinite(lag):  # whole steps
+            lag = np.floor(lag / mhe.model.step + 1e-6) * mhe.model.step
         since, until = max(state.since - lag, last.t[0]), state.t - lag
         path = state.memory["turnpike"].drop_after(since)  # a solve that is repeated replaces its own piece
         if until > since + slack:

@@ -91,13 +91,15 @@ def _inside(
 def trajectory_at(stage: StageFunction, trajectory: Trajectory, t: float) -> Array:
     """Return x(t) inside a trajectory, integrated from the node to its left with the stored w, p and u.
 
-    A node's own value is returned as it is; left of the first node the first, right of the last the last.
+    A node's own value is returned as it is, to round-off: a step map knows no part of a step, so a time just behind a
+    node would be a whole step later. Left of the first node the first counts, right of the last the last.
     """
     nodes = trajectory.t
-    k = int(np.searchsorted(nodes, t, side="left"))
+    slack = 1e-9 * (nodes[-1] - nodes[0]) / max(len(nodes) - 1, 1) + 4 * np.spacing(abs(t))
+    k = int(np.searchsorted(nodes, t - slack, side="left"))
     if k >= len(nodes):
         return trajectory.x[-1]
-    if nodes[k] == t or k == 0:
+    if nodes[k] <= t + slack or k == 0:
         return trajectory.x[k]
     k -= 1
     inputs, ends = (trajectory.u0[k], trajectory.u1[k]), (trajectory.x[k], trajectory.x[k + 1])

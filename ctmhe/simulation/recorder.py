@@ -20,6 +20,7 @@ MESSAGES = {
     "x_true": "true state",
     "x_online": "estimate known at the time: open-loop prediction from the last solve",
     "x_retro": "estimated trajectory (thesis 3.16), left-continuous; the prediction where no solve covers it",
+    "x_delayed": "estimate known a delay later (thesis 6.47), piece by piece; NaN where no solve came in time",
     "y": "measured output, noise included",
     "u": "known input from the time on",
     "w": "disturbance from the time on",
@@ -67,6 +68,9 @@ class Recorder:
         self.guaranteed = loop.mhe.guaranteed
         if self.guaranteed is not None:
             self.grid["retro_level"] = np.full(n, np.nan)
+        self.delay = loop.mhe.delay
+        if self.delay is not None:
+            self.grid["x_delayed"] = np.full((n, len(model.x)), np.nan)
         self.rows = 0
         self.events: list[dict[str, Any]] = []
         self.solves: list[dict[str, Any]] = []
@@ -111,6 +115,8 @@ class Recorder:
                 "theorem_level": np.nan if bound.theorem is None else bound.theorem,
                 "uncertified": "; ".join(bound.reasons),
             }
+        if self.delay is not None:
+            self._keep_delayed(state, estimate, previous, t, self.delay)
         slack = tolerance(t)
         first = max(previous, float(estimate.trajectory.t[0]))
         start, stop = np.searchsorted(self.times, [first + slack, t + slack], side="right")
@@ -119,6 +125,18 @@ class Recorder:
             self.grid["x_retro"][k] = self.loop.mhe.trajectory(state, at)
             if self.guaranteed is not None and estimate.bound is not None and estimate.bound.level is not None:
                 self.grid["retro_level"][k] = self.guaranteed.bounds.at(state.track, at)
+
+    def _keep_delayed(self, state: Any, estimate: Estimate, previous: float, t: float, delay: float) -> None:
+        """Append the piece of the delayed trajectory that this window is the first to know: (previous, t] - delay."""
+        slack = tolerance(t)
+        since = previous - delay
+        if since <= self.times[0]:
+            since = self.times[0] - 2 * slack  # the first piece has the start as well
+        window = float(estimate.trajectory.t[0])  # after a gap longer than horizon - delay something is missing
+        start = np.searchsorted(self.times, max(since + slack, window - slack), side="right")
+        stop = np.searchsorted(self.times, t - delay + slack, side="right")
+        for k in range(start, stop):
+            self.grid["x_delayed"][k] = self.loop.mhe.smooth(state, float(self.times[k]))
 
     def finish(self, p_true: Any) -> Run:
         """Return the run as far as it went."""
@@ -129,6 +147,7 @@ class Recorder:
         grid["x_retro"] = np.where(np.isnan(retro), online, retro)
         states, outputs, parameters = ("state", len(model.x)), ("output", len(model.y)), ("parameter", len(model.p))
         dims = {"x_true": "state", "x_online": "state", "x_retro": "state", "y": "output", "u": "input"}
+        dims |= {"x_delayed": "state"}
         dims |= {"w": "disturbance"}
         variables: dict[str, Any] = {
             name: (("time", dims[name]) if name in dims else "time", values) for name, values in grid.items()
@@ -183,6 +202,7 @@ class Recorder:
             "location": self._location(),
             "monitor": float(loop.monitor),
             "horizon": float(loop.mhe.horizon),
+            **({} if self.delay is None else {"delay": self.delay}),
             "seed": str(loop.seed),
             "measurements": int(loop.estimator.taken),
             "too_late": int(loop.estimator.too_late),

@@ -26,10 +26,11 @@ class Run:
     Attributes
     ----------
     dataset : xarray.Dataset
-        On `time` (monitoring times, seconds): `x_true`, `x_online`, `x_retro` by state, `y` by output, `u` by input,
-        `w` by disturbance, `level` of the trigger. On `event` (samples): `sample_time`, `gap`, `y_sampled`. On `solve`
-        (estimates: one a sample, or a message that arrived): `solve_time`, `x_hat`, `p_hat`, `solve_seconds`, `cost`,
-        `iterations`, `success`, `outcome`, `status`, `delivered`, `x_true_solve`; with a guarantee also its levels.
+        On `time` (monitoring times, seconds): `x_true`, `x_online`, `x_retro` (and `x_delayed`, of an estimator with a
+        delay) by state, `y` by output, `u` by input, `w` by disturbance, `level` of the trigger. On `event` (samples):
+        `sample_time`, `gap`, `y_sampled`. On `solve` (estimates: one a sample, or a message that arrived):
+        `solve_time`, `x_hat`, `p_hat`, `solve_seconds`, `cost`, `iterations`, `success`, `outcome`, `status`,
+        `delivered`, `x_true_solve`; with a guarantee also its levels.
         Units are in the coordinates `state_unit`, ... and in attributes; how the run was made is in the dataset's
         attributes.
     """
@@ -116,6 +117,29 @@ class Run:
         """Return the error of the estimated trajectory (3.16) on the monitoring times, by state."""
         return self._error("x_retro")
 
+    def delayed_error(self) -> xr.DataArray:
+        """Return the error of the delayed estimate (6.47) on the monitoring times, by state.
+
+        NaN in the last `delay` seconds, which the run did not live to see, and where no solve came in time.
+
+        Raises
+        ------
+        InputError
+            For a run whose estimator had no delay, or whose true state is not known.
+        """
+        if "x_delayed" not in self.dataset:
+            raise InputError("run: its estimator had no delay; build it with MHE(delay=seconds)")
+        return self._error("x_delayed")
+
+    def delayed_rms(self, state: str | Sequence[str] | None = None, *, since: float = -np.inf) -> float:
+        """Return the same as `online_rms` for the delayed estimate (6.47), where there is one."""
+        error = self.delayed_error() if state is None else self._error_of("x_delayed", names_of(state))
+        values = error.to_numpy()[self.t >= since]
+        known = np.isfinite(values).all(axis=1)
+        if not known.any():
+            raise InputError(f"run: there is no delayed estimate at or after since = {since!r} s")
+        return float(np.sqrt(np.mean(np.sum(values[known] ** 2, axis=1))))
+
     def online_rms(self, state: str | Sequence[str] | None = None, *, since: float = -np.inf) -> float:
         """Return the root of the mean squared online error over the monitoring times.
 
@@ -195,7 +219,8 @@ class Run:
         import pandas as pd
 
         columns = {}
-        for variable in ("x_true", "x_online", "x_retro", "y", "u", "w"):
+        delayed = ("x_delayed",) if "x_delayed" in self.dataset else ()
+        for variable in ("x_true", "x_online", "x_retro", *delayed, "y", "u", "w"):
             array = self.dataset[variable]
             names = array[array.dims[1]].to_numpy()
             columns |= {f"{variable}.{name}": array.to_numpy()[:, i] for i, name in enumerate(names)}
@@ -321,7 +346,7 @@ class Run:
             if state not in names:
                 raise InputError(f"unknown state {state!r}. Known: {', '.join(names)}")
         error = (self.dataset[variable] - self.dataset["x_true"]).sel(state=list(states))
-        unknown = [state for state in states if np.isnan(error.sel(state=state)).any()]
+        unknown = [state for state in states if np.isnan(self.dataset["x_true"].sel(state=state)).any()]
         if unknown:
             raise InputError(f"run: the true value of {', '.join(unknown)} is not known")
         return error

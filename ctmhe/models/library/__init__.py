@@ -3,8 +3,10 @@
 from ctmhe.models.library.batch_reactor import batch_reactor
 from ctmhe.models.library.cascaded_tanks import cascaded_tanks
 from ctmhe.models.library.chua import chua, chua_discrete
-from ctmhe.models.library.cstr import cstr, cstr_steady_states
-from ctmhe.models.library.quadrotor import hover_speed, quadrotor
+from ctmhe.models.library.cstr import cstr, cstr_discrete, cstr_steady_states
+from ctmhe.models.library.quadrotor import hover_speed, quadrotor, quadrotor_discrete
+from ctmhe.models.library.random_stable import random_stable
+from ctmhe.models.library.refilled_reactor import refill, refilled_reactor
 from ctmhe.models.library.three_species import three_species, three_species_discrete
 from ctmhe.models.library.van_der_pol import van_der_pol
 
@@ -14,9 +16,14 @@ __all__ = [
     "chua",
     "chua_discrete",
     "cstr",
+    "cstr_discrete",
     "cstr_steady_states",
     "hover_speed",
     "quadrotor",
+    "quadrotor_discrete",
+    "random_stable",
+    "refill",
+    "refilled_reactor",
     "three_species",
     "three_species_discrete",
     "van_der_pol",

@@ -9,6 +9,7 @@ import numpy as np
 
 from ctmhe.errors import InputError
 from ctmhe.models.continuous import ContinuousModel
+from ctmhe.models.discrete import DiscreteModel
 from ctmhe.models.library._parts import POSITIVE, Parameters, disturbances
 from ctmhe.types import Array, Bounds, frozen
 
@@ -120,6 +121,55 @@ def cstr(*, noise: bool = True, parameters: str | Sequence[str] = ()) -> Continu
             p=constants.box({name: POSITIVE for name in NOMINAL if name != "DeltaH"}),
         ),
         name="cstr",
+        source="thesis, Section 6.4.2",
+    )
+
+
+def cstr_discrete(*, step: float = 15.0) -> DiscreteModel:
+    """Return one step of the classical Runge-Kutta rule on `cstr`, with additive disturbances.
+
+    Parameters
+    ----------
+    step : float
+        Length of a step in seconds; 15 s are the source's 0.25 min.
+
+    Returns
+    -------
+    DiscreteModel
+        x(k+1) = RK4(x, u) + (w_c [kmol/m3], w_T [K], w_h [m]), temperature = T; the output residual is the noise.
+        Bounds: those of the states of `cstr`.
+
+    Source: thesis, Section 6.4.2.
+    """
+    flow = cstr(noise=False)
+
+    def rate(t, x, u, p):
+        return flow.dynamics(t, x, u, 0, p)
+
+    def f(t, x, u, w, p):
+        k1 = rate(t, x, u, p)
+        k2 = rate(t, x + step / 2 * k1, u, p)
+        k3 = rate(t, x + step / 2 * k2, u, p)
+        k4 = rate(t, x + step * k3, u, p)
+        return x + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4) + w
+
+    names = flow.w.names
+    return DiscreteModel(
+        f,
+        lambda t, x, u, w, p: x[1],
+        step=step,
+        x=STATES,
+        u=flow.u.names,
+        w=names,
+        y=OUTPUTS,
+        units={"c": "kmol/m3", "T": "K", "h": "m", "T_c": "K", "F": "m3/min", "temperature": "K"}
+        | dict(zip(names, ("kmol/m3", "K", "m"), strict=True)),
+        nominal=dict(
+            zip((*STATES, *flow.u.names, *OUTPUTS), (*flow.x.nominal, *flow.u.nominal, *flow.y.nominal), strict=True)
+        )
+        | dict(zip(names, (5e-3, 1.0, 5e-3), strict=True)),
+        bounds=Bounds(x=flow.bounds.x),
+        name="cstr, RK4",
         source="thesis, Section 6.4.2",
     )
 

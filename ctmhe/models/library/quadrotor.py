@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 
 from ctmhe.models.continuous import ContinuousModel
+from ctmhe.models.discrete import DiscreteModel
 from ctmhe.models.library._parts import disturbances
 from ctmhe.types import Bounds
 
@@ -102,6 +103,43 @@ def quadrotor(*, noise: bool = True) -> ContinuousModel:
         ),
         name="quadrotor",
         source="thesis (3.45)",
+    )
+
+
+def quadrotor_discrete(*, step: float = 0.05) -> DiscreteModel:
+    """Return one Euler step of `quadrotor`, with additive disturbances.
+
+    Parameters
+    ----------
+    step : float
+        Length of a step in seconds.
+
+    Returns
+    -------
+    DiscreteModel
+        x(k+1) = x + step f(x, u) + w with one w for each state, in the state's unit; y = (z1..z3, phi, theta, psi). The
+        output residual is the noise. No bounds.
+
+    Source: thesis, Section 6.4.2.
+    """
+    flow = quadrotor(noise=False)
+    units = dict(zip(flow.x.names, flow.x.units, strict=True))
+    sizes = (2e-2, 2e-5, 2e-3, 2e-6)  # of w, as the source draws it: positions, angles, velocities, rates
+
+    return DiscreteModel(
+        lambda t, x, u, w, p: x + step * flow.dynamics(t, x, u, 0, p) + w,
+        lambda t, x, u, w, p: x[:6],
+        step=step,
+        x=STATES,
+        u=ROTORS,
+        w=flow.w.names,
+        y=OUTPUTS,
+        units=units | dict.fromkeys(ROTORS, "rad/s") | {f"w_{name}": unit for name, unit in units.items()},
+        nominal=dict.fromkeys(ANGLES, 0.5)
+        | dict.fromkeys(ROTORS, hover_speed())
+        | {name: sizes[i // 3] for i, name in enumerate(flow.w.names)},
+        name="quadrotor, Euler",
+        source="thesis, Section 6.4.2",
     )
 
 

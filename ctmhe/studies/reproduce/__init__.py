@@ -15,9 +15,12 @@ from ctmhe.studies.reproduce import (
     thesis_3_4_2_certificate,
     thesis_4_3_3_horizons,
     thesis_5_2_4_horizon,
+    thesis_6_2_1,
     thesis_printed_certificates,
     thesis_table_3_2,
     thesis_table_4_2,
+    thesis_table_6_1,
+    thesis_table_6_2,
 )
 
 CASES: dict[str, Callable[..., dict[str, Any]]] = {
@@ -30,6 +33,9 @@ CASES: dict[str, Callable[..., dict[str, Any]]] = {
     "certified-runs": certified_runs.reproduce,
     "thesis-3.4.2-certificate": thesis_3_4_2_certificate.reproduce,
     "thesis-printed-certificates": thesis_printed_certificates.reproduce,
+    "thesis-6.2.1": thesis_6_2_1.reproduce,
+    "thesis-table-6.1": thesis_table_6_1.reproduce,
+    "thesis-table-6.2": thesis_table_6_2.reproduce,
     "study-reactor-budget": study_reactor_budget.reproduce,
     "study-solves-saved": study_solves_saved.reproduce,
 }
