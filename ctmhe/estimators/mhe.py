@@ -17,6 +17,7 @@ from ctmhe.certificates.guarantee import Guarantee
 from ctmhe.data.log import Log
 from ctmhe.data.window import held_inputs
 from ctmhe.errors import InputError, NotEstimated, TooLate
+from ctmhe.estimators.base import check_wait
 from ctmhe.estimators.guaranteed import Guaranteed
 from ctmhe.estimators.guesses import open_loop, resting_guess, starting_points
 from ctmhe.estimators.outlook import carried_covariance, prior_covariance
@@ -197,7 +198,7 @@ class MHE:
         self.cost = cost
         self.longest_wait = longest_wait
         if longest_wait is not None:
-            self.check_wait(positive("longest_wait", longest_wait, "seconds"))
+            check_wait(self.horizon, positive("longest_wait", longest_wait, "seconds"))
         if solver not in SOLVERS:
             raise InputError(f"solver must be one of {', '.join(SOLVERS)}, got {solver!r}")
         self.hold_limit = self.horizon if hold_limit is None else positive("hold_limit", hold_limit, "seconds")
@@ -249,15 +250,15 @@ class MHE:
         kind = f"{type(self.integrator).__name__}, interval {self.interval:g} s"
         return f"MHE of {self.model.name!r}: horizon {self.horizon:g} s, {kind}, eta {self.cost.eta:g}"
 
-    def check_wait(self, wait: float) -> None:
-        """Raise `InputError` unless a declared longest wait between estimates is shorter than the horizon (3.19)."""
-        if not wait < self.horizon:
-            raise InputError(
-                f"the declared longest wait of {wait:g} s is not shorter than the horizon of "
-                f"{self.horizon:g} s: the prior at the "
-                "window's edge would not be estimated yet (thesis 3.19). Lengthen the horizon or bound the wait, "
-                "for example with | MaxInterval(...)"
-            )
+    @property
+    def p_estimated(self) -> bool:
+        """Whether the prior's weight covers the parameters."""
+        return self.assembly.p_estimated
+
+    @property
+    def input_linear(self) -> bool:
+        """Whether inputs are interpolated between their samples."""
+        return self.assembly.input_linear
 
     def init(self, *, t: float = 0.0, x: Any, p: Any = None) -> State:
         """Return the state at the start of estimation.

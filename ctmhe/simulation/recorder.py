@@ -64,7 +64,7 @@ class Recorder:
             "w": np.full((n, len(plant.w)), np.nan),
             "level": np.full(n, np.nan),
         }
-        self.guaranteed = loop.mhe.guaranteed
+        self.guaranteed = None if loop.certified is None else loop.certified.guaranteed
         if self.guaranteed is not None:
             self.grid["retro_level"] = np.full(n, np.nan)
         self.rows = 0
@@ -116,7 +116,7 @@ class Recorder:
         start, stop = np.searchsorted(self.times, [first + slack, t + slack], side="right")
         for k in range(start, stop):
             at = min(float(self.times[k]), t)
-            self.grid["x_retro"][k] = self.loop.mhe.trajectory(state, at)
+            self.grid["x_retro"][k] = self.loop.configured.trajectory(state, at)
             if self.guaranteed is not None and estimate.bound is not None and estimate.bound.level is not None:
                 self.grid["retro_level"][k] = self.guaranteed.bounds.at(state.track, at)
 
@@ -177,12 +177,12 @@ class Recorder:
             "plant": plant.name,
             "integrator": plant.integrator,
             "model": model.name,
-            "estimator": repr(loop.mhe),
+            "estimator": repr(loop.configured),
             "trigger": repr(loop.watch.policy),
             "channel": repr(loop.channel),
             "location": self._location(),
             "monitor": float(loop.monitor),
-            "horizon": float(loop.mhe.horizon),
+            "horizon": float(loop.configured.horizon),
             "seed": str(loop.seed),
             "measurements": int(loop.estimator.taken),
             "too_late": int(loop.estimator.too_late),
@@ -207,7 +207,7 @@ class Recorder:
             "P_lower": P.reshape(-1),
             "domain_level": bounds.cap,
             "wait_limit": bounds.limit,
-            "holds": ", ".join(sorted(set(self.loop.mhe.hold.values()))),
+            "holds": ", ".join(sorted(set(self.loop.configured.hold.values()))),
             "records_at_events": int(isinstance(channel, WholeSignal)),
         }
 
