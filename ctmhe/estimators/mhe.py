@@ -27,6 +27,7 @@ from ctmhe.models.continuous import Model
 from ctmhe.models.signals import Signals
 from ctmhe.solvers.base import Solution, Solver
 from ctmhe.solvers.compiled import compiled_solver
+from ctmhe.solvers.dual import DualIterations
 from ctmhe.solvers.gauss_newton import GaussNewton
 from ctmhe.solvers.ipopt import Ipopt
 from ctmhe.solvers.ladder import climb
@@ -113,7 +114,7 @@ class MHE:
         The longest wait between estimates, if declared; must be shorter than the horizon (3.19).
     guarantee : Guarantee, optional
         A certificate and how large disturbances are: every estimate then has a `bound`, or says why not.
-    solver : {"gauss-newton", "numpy", "ipopt"}
+    solver : {"gauss-newton", "numpy", "ipopt"} or DualIterations
         `gauss-newton` runs in the compiled core; `numpy` is the same method in Python, which also takes over where
         there is no core; `ipopt` is the reference.
     compile : {"auto", "off"}, optional
@@ -155,7 +156,7 @@ class MHE:
         filtering: bool = False,
         longest_wait: float | None = None,
         guarantee: Guarantee | None = None,
-        solver: str = "gauss-newton",
+        solver: str | DualIterations = "gauss-newton",
         compile: str | None = None,
         tolerance: float | None = None,
         max_iterations: int | None = None,
@@ -199,8 +200,9 @@ class MHE:
         self.longest_wait = longest_wait
         if longest_wait is not None:
             check_wait(self.horizon, positive("longest_wait", longest_wait, "seconds"))
-        if solver not in SOLVERS:
-            raise InputError(f"solver must be one of {', '.join(SOLVERS)}, got {solver!r}")
+        dual = solver if isinstance(solver, DualIterations) else None
+        if dual is None and solver not in SOLVERS:
+            raise InputError(f"solver must be one of {', '.join(SOLVERS)} or DualIterations(...), got {solver!r}")
         self.hold_limit = self.horizon if hold_limit is None else positive("hold_limit", hold_limit, "seconds")
         self.hold = dict(zip(model.y.names, hold_kinds(model, hold), strict=True))
         signal = any(kind != "point" for kind in self.hold.values())
@@ -229,14 +231,16 @@ class MHE:
             raise InputError(f"compile must be 'off' or 'auto', got {compile!r}")
         self._solver: Solver = self._reference if solver == "ipopt" else self._gauss_newton
         compiled = None
-        if solver == "gauss-newton":
-            choice = {"specialise": compile == "auto", "p_estimated": self.assembly.p_estimated}
+        if solver == "gauss-newton" or dual:
+            choice = {"specialise": compile == "auto" and not dual, "p_estimated": self.assembly.p_estimated}
             compiled = compiled_solver(self.stage, **choice, **limits)
             self._solver = compiled or self._gauss_newton
         self._covariance = (compiled or self._gauss_newton).covariance
         self._layout = Layout.of(self.stage)
         self._updates = None
-        if compiled is not None and CompiledUpdates.covers(self.assembly):
+        if dual is not None:
+            self._solver, self._real_time = dual.on(self.stage, self._solver), True
+        elif compiled is not None and CompiledUpdates.covers(self.assembly):
             self._updates = CompiledUpdates(compiled, self.assembly, self._layout, real_time=self._real_time)
         self._check = Ipopt(self.stage, options={"ipopt.mu_init": 1e-8}) if verify else None
         self._holds = bool(self.assembly.held.any())
