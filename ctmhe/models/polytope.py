@@ -59,7 +59,7 @@ def polytope(
     if not vertices:
         raise InputError("polytope: no vertices")
     nx, q = len(vertices[0]), len(vertices)
-    outputs = [_matrix(c, "C") for c in C] if np.ndim(C) == 3 or q > 1 and len(C) == q else [_matrix(C, "C")] * q
+    outputs = [_matrix(c, "C") for c in C] if np.ndim(C) == 3 else [_matrix(C, "C")] * q
     if len(outputs) == 1:
         outputs *= q
     for i, (a, c) in enumerate(zip(vertices, outputs, strict=False)):
