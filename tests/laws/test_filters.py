@@ -131,7 +131,7 @@ def test_extended_and_unscented_are_kalman_on_linear_models(kind, seed):
 
 
 def test_white_noise_gives_the_continuous_discrete_kalman_filter(rng):
-    """Between samples the covariance is exp(A h) P exp(A h)' plus the integral of exp(A s) W exp(A s)', by quadrature."""
+    """Between samples P becomes exp(A h) P exp(A h)' plus the integral of exp(A s) W exp(A s)', by quadrature."""
     A, C = np.array([[0, 1.0], [-2, -0.3]]), np.array([[1.0, 0]])
     P, Q, R = np.diag([2.0, 3.0]), np.array([[5.0, 1.0], [1.0, 8.0]]), 6.0
     times, rows = irregular(rng, 2.0, 9, 1)
@@ -167,7 +167,8 @@ def test_parameters_are_estimated_as_states_that_stay():
 
 
 A, C = np.array([[0.7, 0.2], [-0.1, 0.6]]), np.array([[1.0, 0.5]])
-VERTICES = [(A + [[0.1, 0], [0, 0]], C), (A + [[0, 0.1], [0.05, 0]], C + 0.1), (A - [[0.05, 0.1], [0, 0.05]], C)]
+SHIFTS = np.array([[[0.1, 0], [0, 0]], [[0, 0.1], [0.05, 0]], [[-0.05, -0.1], [0, -0.05]]])
+VERTICES = [(A + SHIFTS[0], C), (A + SHIFTS[1], C + 0.1), (A + SHIFTS[2], C)]
 
 
 def robust(cost):
