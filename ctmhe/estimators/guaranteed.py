@@ -12,6 +12,7 @@ import numpy as np
 from ctmhe.certificates.certificate import DetectabilityCertificate
 from ctmhe.certificates.guarantee import Guarantee, Track, WindowBounds, largest_square
 from ctmhe.errors import InputError
+from ctmhe.estimators.priors import Filtering
 from ctmhe.models.continuous import Model, box_arrays
 from ctmhe.transcription.weights import weight_matrix
 from ctmhe.types import Array, ErrorBound, Outcome, Status
@@ -172,6 +173,8 @@ def _scaled(own: DetectabilityCertificate, mhe: MHE) -> tuple[DetectabilityCerti
         problems.append(f"weight {', '.join(varying)} varies in time: Remark 3.4 needs bounds for that")
     if cost.prior_eta != cost.eta:
         problems.append(f"prior_eta = {cost.prior_eta:g} differs from eta = {cost.eta:g}: (3.13) has one discount")
+    if not isinstance(mhe.prior, Filtering):
+        problems.append("the prior is not the filtering prior (3.18)")
     if cost.S is not None:
         problems.append("the terminal weight S is not part of (3.13)")
     if problems:

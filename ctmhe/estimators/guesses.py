@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ctmhe.estimators.priors import trajectory_at
 from ctmhe.estimators.state import State
+from ctmhe.estimators.trajectories import trajectory_at
 from ctmhe.solvers.base import Solution
 from ctmhe.transcription.problem import Guess, Window, rollout
 from ctmhe.transcription.stage import StageFunction

@@ -21,8 +21,9 @@ from ctmhe.estimators.base import check_wait
 from ctmhe.estimators.guaranteed import Guaranteed
 from ctmhe.estimators.guesses import open_loop, resting_guess, starting_points
 from ctmhe.estimators.outlook import carried_covariance, prior_covariance
-from ctmhe.estimators.priors import empty_path, filtering_prior, path_rows, trajectory_at
+from ctmhe.estimators.priors import Anchor, Filtering, Prior, prior_of
 from ctmhe.estimators.state import State, load_state, save_state
+from ctmhe.estimators.trajectories import empty_path, path_at, path_rows, trajectory_at
 from ctmhe.models.continuous import Model
 from ctmhe.models.signals import Signals
 from ctmhe.solvers.base import Solution, Solver
@@ -89,7 +90,8 @@ class MHE:
     model : Model
         A `ContinuousModel`, `DiscreteModel` or `FmuModel`.
     horizon : float
-        Length T of the window in seconds; the window grows to it from t0.
+        Length T of the window in seconds; the window grows to it from t0. Infinite: full information estimation, a
+        window that goes on growing, and so do the time of a solve and the memory.
     interval : float, optional
         Shooting interval and cell on which w is constant, seconds, anchored at its absolute multiples. The step of a
         `DiscreteModel` when left out.
@@ -98,6 +100,9 @@ class MHE:
     cost : DiscountedCost
         Weights and discount. A prior weight over states only holds the parameters at their given values; one over
         states and parameters estimates them.
+    prior : {"filtering", "smoothing", "turnpike"} or Prior, optional
+        Where the window's prior comes from: the estimated trajectory (3.18), the last solution (6.65), the solution
+        half a horizon later (6.66), or a rule of your own. P = 0 is no prior at all.
     bounds : Bounds, optional
         Imposed on x at every node (cell edges, samples, input switches), on w and p, and on y and the output residual
         at the nodes.
@@ -149,6 +154,7 @@ class MHE:
         interval: float | None = None,
         integrator: Integrator | None = None,
         cost: DiscountedCost,
+        prior: str | Prior = "filtering",
         bounds: Bounds | None = None,
         hold: Any = None,
         hold_limit: float | None = None,
@@ -178,7 +184,8 @@ class MHE:
         self._real_time = max_iterations is not None or deadline is not None
         if self._real_time and solver == "ipopt":
             raise InputError("max_iterations and deadline are for Gauss-Newton; IPOPT runs to convergence")
-        self.horizon = positive("horizon", horizon, "seconds")
+        self.horizon = np.inf if horizon == np.inf else positive("horizon", horizon, "seconds")
+        self.prior = prior_of(prior)
         if model.step is not None:
             if integrator is not None:
                 raise InputError("integrator: a DiscreteModel has its own step map; leave the integrator out")
@@ -204,6 +211,8 @@ class MHE:
         if dual is None and solver not in SOLVERS:
             raise InputError(f"solver must be one of {', '.join(SOLVERS)} or DualIterations(...), got {solver!r}")
         self.hold_limit = self.horizon if hold_limit is None else positive("hold_limit", hold_limit, "seconds")
+        # what the core does by itself: the filtering prior with one weight
+        self._plain_prior = type(self.prior) is Filtering and not callable(cost.P)
         self.hold = dict(zip(model.y.names, hold_kinds(model, hold), strict=True))
         signal = any(kind != "point" for kind in self.hold.values())
         self.stage = StageFunction(model, integrator, signal=signal, interval=self.interval)
@@ -286,6 +295,7 @@ class MHE:
             inputs = inputs.put(t, frozen(u_start))
         start = frozen(np.concatenate([x0, p0]))
         state = State(t, t, start, x0, p0, Log(len(model.y)), inputs, empty_path(self.stage), t)
+        state = made(State, state.__dict__ | {"memory": self.prior.begin(self, state)})
         if self.guaranteed is not None:
             state = made(State, state.__dict__ | {"track": self.guaranteed.begin(t, x0)})
             for reason in self.guaranteed.outside(p0):
@@ -306,7 +316,7 @@ class MHE:
 
     def _revised(self, state: State, t: float) -> State:
         """Return the state whose bounds do not rest on what was solved with other data at `t` and later."""
-        if self.guaranteed is None or state.track is None or t >= state.t - self._slack(t):
+        if self.guaranteed is None or state.track is None or t >= state.t - self.slack(t):
             return state
         track = self.guaranteed.bounds.resumed(state.track, state.t, since=t)
         return made(State, state.__dict__ | {"track": track})
@@ -363,7 +373,7 @@ class MHE:
             self._check_age(state, value.t, "input")
         return self._revised(state, value.t).knowing(state.measurements, state.inputs.put(value.t, u))
 
-    def _slack(self, t: float) -> float:
+    def slack(self, t: float) -> float:
         """Return the difference below which two times near `t` are the same."""
         return same_time(self.interval, t)
 
@@ -371,9 +381,9 @@ class MHE:
         edge = state.t - self.horizon
         if t >= state.t0 and t >= edge:
             return
-        if t < state.t0 - self._slack(t):
+        if t < state.t0 - self.slack(t):
             raise TooLate(f"{what} at t = {t:g} s is older than the start of estimation at {state.t0:g} s")
-        if t < edge - self._slack(t):
+        if t < edge - self.slack(t):
             raise TooLate(
                 f"{what} at t = {t:g} s is older than the window, which starts at {edge:g} s; a longer horizon "
                 f"(now {self.horizon:g} s) accepts later arrivals"
@@ -381,7 +391,7 @@ class MHE:
 
     def _check_step(self, t: float, what: str) -> None:
         step = self.model.step
-        if step is not None and abs(t - round(t / step) * step) > max(1e-6 * step, self._slack(t)):
+        if step is not None and abs(t - round(t / step) * step) > max(1e-6 * step, self.slack(t)):
             raise InputError(f"{what} at t = {t:g} s is not at a multiple of the discrete model's step {step:g} s")
 
     def estimate(self, state: State, t: float) -> tuple[State, Estimate]:
@@ -410,7 +420,7 @@ class MHE:
         state = _checked(state, self)
         t = finite_time(t, "estimate")
         if t < state.t:
-            if t < state.t - self._slack(t):
+            if t < state.t - self.slack(t):
                 raise NotEstimated(
                     f"estimate at t = {t:g} s lies before the last one at {state.t:g} s; "
                     "smooth(state, t) gives estimates of the past"
@@ -421,10 +431,14 @@ class MHE:
         since = state.since if t == state.t else state.t  # a solve repeated with what has arrived takes its own place
         if self._updates is not None:
             logs = (state.measurements, state.inputs, state.path)
-            known, times = (state.start, state.p), (state.t, since)
-            update = self._updates.run(*self._span(state, t), *logs, state.window, known, times, state.prepared)
+            span, growing = self._span(state, t)
+            anchor, notes = self._anchor(state, span, growing)
+            request = (span, growing, *logs, state.window, state.p, (state.t, since), anchor)
+            update = self._updates.run(*request, state.prepared)
             if update is not None:
                 added, status = (update.path_times, update.path_rows), self._told(update.status, failures)
+                if notes:
+                    status = replace(status, notes=(*notes, *status.notes))
                 return self._conclude(state, t, since, update.solved, added, update.cost, status, began)
         window, notes = self._window(state, t)
         guesses = starting_points(self.stage, state, window)
@@ -465,7 +479,7 @@ class MHE:
             To be given to `observe`, `control` and `estimate`.
         """
         state, t = _checked(state, self), finite_time(t, "prepare")
-        if t < state.t - self._slack(t):
+        if t < state.t - self.slack(t):
             raise NotEstimated(f"prepare at t = {t:g} s lies before the last estimate at {state.t:g} s")
         expected = np.full(len(self.model.y), np.nan)
         expected[[self.model.y.index(name) for name in (self.model.y.names if outputs is None else outputs)]] = 0.0
@@ -475,8 +489,9 @@ class MHE:
         if measurements.find(t) is None:
             measurements = measurements.put(t, expected)
         since = state.since if t == state.t else state.t
-        logs, known = (measurements, state.inputs, state.path), (state.start, state.p)
-        ticket = self._updates.prepare(*self._span(state, t), *logs, state.window, known, (state.t, since))
+        span, growing = self._span(state, t)
+        logs, anchor = (measurements, state.inputs, state.path), self._anchor(state, span, growing)[0]
+        ticket = self._updates.prepare(span, growing, *logs, state.window, state.p, (state.t, since), anchor)
         return made(State, state.__dict__ | {"prepared": ticket})
 
     def _told(self, status: Status, before: int) -> Status:
@@ -492,43 +507,56 @@ class MHE:
     def _span(self, state: State, end: float) -> tuple[tuple[float, float], bool]:
         """Return start and end of the window that ends at `end`, and whether it still grows."""
         start = end - self.horizon
-        growing = start <= state.t0 + self._slack(end)
+        growing = start <= state.t0 + self.slack(end)
         return (state.t0 if growing else start, end), growing
 
     def _window(self, state: State, end: float) -> tuple[Window, tuple[str, ...]]:
         """Return the problem of the window that ends at `end`, and what there is to note about it."""
         (start, _), growing = self._span(state, end)
-        prior, factor, notes = self._prior(state, start, growing)
+        anchor = self._prior(state, start, growing)
+        weight = {"prior_factor": anchor.factor, "prior_weight": anchor.weight}
         records = self._records(state, end, start)
-        window = self.assembly.window(start, end, records, prior, growing=growing, prior_factor=factor)
-        return window, notes if window.L_y.any() else (*notes, "no measurement in window")
+        window = self.assembly.window(start, end, records, anchor.value, growing=growing, **weight)
+        return window, anchor.notes if window.L_y.any() else (*anchor.notes, "no measurement in window")
 
-    def _prior(self, state: State, start: float, growing: bool) -> tuple[Array, float, tuple[str, ...]]:
-        """Return the prior (3.18), the factor on its weight, and notes.
+    def _anchor(
+        self, state: State, span: tuple[float, float], growing: bool
+    ) -> tuple[tuple[Array, Array | None] | None, tuple[str, ...]]:
+        """Return the prior as the core takes it, with the root of its weight where that is not the cost's; and notes.
 
-        In a gap longer than the horizon the trajectory does not reach back to the window's start: the prior is the
-        prediction, and its weight fades by exp(-g / T) on top of the discount's eta^g for a gap of g seconds beyond it.
+        None instead of a prior that the core finds itself.
         """
-        if growing:
-            return state.start, 1.0, ()
-        slack = self._slack(state.t)
-        if start <= state.t + slack:
-            prior = filtering_prior(self.stage, state.path, min(start, state.t), slack)
-            if prior is not None:
-                return prior, 1.0, ()
+        if self._plain_prior:
+            return (state.start, None) if growing else None, ()
+        start, end = span
+        anchor = self._prior(state, start, growing)
+        if anchor.weight is None and anchor.factor == 1.0 and not callable(self.cost.P):
+            return (anchor.value, None), anchor.notes
+        root = self.assembly.prior_root(start, end - start, anchor.factor, anchor.weight)
+        return (anchor.value, root), anchor.notes
+
+    def _prior(self, state: State, start: float, growing: bool) -> Anchor:
+        """Return the prior of a window.
+
+        In a gap longer than the horizon no solution reaches back to the window's start: the prior is the prediction,
+        and its weight fades by exp(-g / T) on top of the discount's eta^g for a gap of g seconds beyond it.
+        """
+        anchor = self.prior.at(self, state, start, growing)
+        if anchor is not None:
+            return anchor
         gap = max(start - state.t, 0.0)
         x = self.propagate(state, state.t, start, state.x, state.p)
         factor = float(np.exp(-gap * (self.assembly.prior_rate + 1.0 / self.horizon)))
-        return np.concatenate([x, state.p]), factor, ("prior predicted, uncertified",)
+        return Anchor(np.concatenate([x, state.p]), ("prior predicted, uncertified",), factor)
 
     def _records(self, state: State, end: float, start: float) -> Records:
-        y_times, y = state.measurements.arrays(end + self._slack(end))
+        y_times, y = state.measurements.arrays(end + self.slack(end))
         return Records(y_times, y, *self._known_inputs(state, start, end))
 
     def _known_inputs(self, state: State, start: float, end: float) -> tuple[Array, Array]:
         """Return the inputs that matter on [start, end]: for linear hold also the first one behind it, if known."""
         times, rows = state.inputs.arrays(end, beyond=int(self.assembly.input_linear))
-        if len(self.model.u) and (not len(times) or times[0] > start + self._slack(start)):
+        if len(self.model.u) and (not len(times) or times[0] > start + self.slack(start)):
             raise InputError(
                 f"no input is known at t = {start:g} s for {', '.join(self.model.u.names)}; give "
                 f"control(state, Input(t={start:g}, u=...)) first"
@@ -567,14 +595,14 @@ class MHE:
         edge = t - self.horizon
         slack = 1e-6 * self.interval
         path = state.path if t > state.t else state.path.drop_after(since)
-        held = self.hold_limit if self._holds else 0.0
+        held = (self.hold_limit if self._holds else 0.0) + self.prior.reach
         inputs = state.inputs
         fields = {
             "t": t,
             "x": x,
             "p": p,
             "measurements": state.measurements.drop_before(edge - held - slack),
-            "inputs": inputs.drop_before(edge - slack, keep_holding=True) if len(inputs) else inputs,
+            "inputs": inputs.drop_before(edge - self.prior.reach - slack, keep_holding=True) if len(inputs) else inputs,
             "path": path.extend(*added).drop_before(edge - slack),
             "since": since,
             "window": solved,
@@ -584,7 +612,7 @@ class MHE:
         bound = None
         if self.guaranteed is not None:
             first = float(solved.part("t")[0])
-            times, rows = state.measurements.arrays(t + self._slack(t))
+            times, rows = state.measurements.arrays(t + self.slack(t))
             track = self.guaranteed.resume(state.track, state.t0, state.start[: self.stage.nx], state.t)
             outside = () if track is state.track else self.guaranteed.outside(state.p)
             known = (*state.doubts, *((np.inf, reason) for reason in outside))
@@ -593,16 +621,19 @@ class MHE:
             fields["track"], bound = self.guaranteed.after(track, first, t, cost, status, reasons)
             fields["doubts"] = self.guaranteed.current(known, times, edge - slack)
         new = made(State, state.__dict__ | fields)
+        memory = self.prior.after(self, new, solved)
+        if memory is not new.memory:
+            new = made(State, new.__dict__ | {"memory": memory})
 
         def covariance() -> tuple[Array, int]:
             window, _ = self._window(state, t)
             values, rank = self._covariance(window, solved.guess)
             return frozen(values), rank
 
-        known = None if status.outcome is Outcome.PREDICTED else covariance
+        spread = None if status.outcome is Outcome.PREDICTED else covariance
         seconds = self.clock() - began
         fields = {"t": t, "x": x, "p": p, "w": w, "y": y, "cost": cost, "status": status, "_solved": solved,
-                  "seconds": seconds, "_covariance": known, "bound": bound}  # fmt: skip
+                  "seconds": seconds, "_covariance": spread, "bound": bound}  # fmt: skip
         return new, made(Estimate, fields)
 
     def propagate(self, state: State, t0: float, t1: float, x: Array, p: Array) -> Array:
@@ -645,7 +676,7 @@ class MHE:
             return x, self.output(state, t1, x, p)
         times, rows = self._known_inputs(state, t0, t1)
         constant = self._is_constant(times, t0)
-        slack = self._slack(t1)
+        slack = self.slack(t1)
         edge = (floor((t0 + slack) / self.interval) + 1) * self.interval
         ends = NOTHING
         try:
@@ -716,7 +747,7 @@ class MHE:
         u = np.empty(0)
         if len(self.model.u):
             times, rows = self._known_inputs(state, t, t)
-            u, _ = held_inputs(times, rows, np.array([t, t]), self._slack(t), self.assembly.input_linear)
+            u, _ = held_inputs(times, rows, np.array([t, t]), self.slack(t), self.assembly.input_linear)
             u = u[0]
         return self._output(t, x, u, self._silent, p)
 
@@ -735,7 +766,7 @@ class MHE:
             If `t` lies before the last estimate.
         """
         t = finite_time(t, "predict")
-        if t < state.t - self._slack(t):
+        if t < state.t - self.slack(t):
             raise NotEstimated(
                 f"prediction at t = {t:g} s lies before the last estimate at {state.t:g} s; use smooth(state, t)"
             )
@@ -770,7 +801,7 @@ class MHE:
         first = state.path.first_from(-np.inf)
         if t == state.t0 and (first is None or first[1][1] == state.t0):
             return frozen(state.start[: self.stage.nx])
-        value = filtering_prior(self.stage, state.path, t, self._slack(t))
+        value = path_at(self.stage, state.path, t, self.slack(t))
         if value is None:
             raise NotEstimated(
                 f"trajectory at t = {t:g} s: kept is the horizon before the last estimate at {state.t:g} s"
@@ -785,7 +816,7 @@ class MHE:
         t = finite_time(t, "trajectory_bound")
         if self.guaranteed is None or state.track is None or self.guaranteed.unmet:
             return None
-        if not max(state.t0, state.t - self.horizon) - self._slack(t) <= t <= state.t + self._slack(t):
+        if not max(state.t0, state.t - self.horizon) - self.slack(t) <= t <= state.t + self.slack(t):
             raise NotEstimated(
                 f"trajectory_bound at t = {t:g} s: kept is the horizon before the last estimate at {state.t:g} s"
             )

@@ -1,87 +1,174 @@
-"""The estimated trajectory (3.16) and the priors read from it.
+"""Priors: how a window's past enters its cost, and what has to be remembered for it.
 
-It is kept as a `Log` of slots, the path. A row belongs to the time at which its slot ends and holds the slot's start,
-from when on the row counts (a later solve never rewrites what an earlier one said), x, w, u0, u1, p, and x at its end.
+A prior is asked for its value at the start of every window and told every solution. All that it remembers lies in
+`State.memory`, as logs: rows of numbers, each with its time.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
+
 import numpy as np
 
 from ctmhe.data.log import Log
-from ctmhe.transcription.stage import StageFunction
-from ctmhe.types import Array, Trajectory
+from ctmhe.errors import InputError
+from ctmhe.estimators.trajectories import empty_path, lagged_rows, path_at, trajectory_at
+from ctmhe.transcription.solved import Solved
+from ctmhe.types import Array, frozen
+
+if TYPE_CHECKING:
+    from ctmhe.estimators.mhe import MHE
+    from ctmhe.estimators.state import State
+
+Memory = Mapping[str, Log]
+NOTHING: Memory = {}
 
 
-def empty_path(stage: StageFunction) -> Log:
-    """Return the path before the first estimate."""
-    return Log(2 + 2 * stage.nx + stage.nw + 2 * stage.nu + stage.np)
+@dataclass(frozen=True, eq=False)
+class Anchor:
+    """The prior of one window.
 
-
-def path_rows(trajectory: Trajectory, since: float) -> tuple[Array, Array]:
-    """Return ends (m,) and rows (m, width) of the slots of a window's solution that reach beyond `since`."""
-    t, last = trajectory.t, len(trajectory.t) - 2
-    first = int(np.clip(np.searchsorted(t, since, side="right") - 1, 0, last))
-    slots = np.array([k for k in range(first, last + 1) if t[k + 1] > t[k]], dtype=int)
-    p = np.broadcast_to(trajectory.p, (len(slots), len(trajectory.p)))
-    start = t[slots]
-    parts = (start, np.maximum(start, since), trajectory.x[slots], trajectory.w[slots], trajectory.u0[slots],
-             trajectory.u1[slots], p, trajectory.x[slots + 1])  # fmt: skip
-    return t[slots + 1], np.column_stack(parts)
-
-
-def filtering_prior(stage: StageFunction, path: Log, t: float, tolerance: float) -> Array | None:
-    """Return (x_hat(t), p_hat(t)) of the estimated trajectory: the prior (3.18). None where it is not kept.
-
-    Where a solve ends and the next begins, the earlier one counts (3.17). Times closer than `tolerance` (seconds) to
-    that instant are that instant: round-off must not choose.
+    Attributes
+    ----------
+    value : array (nx + np,)
+        Prior of state and parameters at the window's start.
+    notes : tuple of str
+        For the status of the estimate.
+    factor : float
+        On the weight, beside its discount.
+    weight : array (n, n), optional
+        In place of the cost's P, n = nx, or nx + np where the parameters are estimated.
     """
-    if t > path.last_time + tolerance:
-        return None
-    found = path.first_from(min(t - tolerance, path.last_time))
-    if found is None:
-        return None
-    end, row = found
-    sizes = (stage.nx, stage.nw, stage.nu, stage.nu, stage.np, stage.nx)
-    x, w, u0, u1, p, x_end = np.split(row[2:], np.cumsum(sizes)[:-1])
-    start, since = row[:2]
-    if t <= since + tolerance:
-        return None
-    if t >= end:
-        x = x_end
-    elif t > start:
-        x = _inside(stage, t, (start, end), (x, x_end), w, p, (u0, u1))
-    return np.concatenate([x, p])
+
+    value: Array
+    notes: tuple[str, ...] = ()
+    factor: float = 1.0
+    weight: Array | None = None
 
 
-def _inside(
-    stage: StageFunction,
-    t: float,
-    span: tuple[float, float],
-    ends: tuple[Array, Array],
-    w: Array,
-    p: Array,
-    u: tuple[Array, Array],
-) -> Array:
-    """Return the state at `t` inside a slot whose ends are known: integrated, or if that fails on a straight line."""
-    share = (t - span[0]) / (span[1] - span[0])
-    try:
-        return stage.step(span[0], t - span[0], ends[0], w, p, u[0], u[0] + (u[1] - u[0]) * share)[0]
-    except FloatingPointError:
-        return ends[0] + (ends[1] - ends[0]) * share
+@runtime_checkable
+class Prior(Protocol):
+    """The prior of every window: a rule, without state of its own.
 
-
-def trajectory_at(stage: StageFunction, trajectory: Trajectory, t: float) -> Array:
-    """Return x(t) inside a trajectory, integrated from the node to its left with the stored w, p and u.
-
-    A node's own value is returned as it is; left of the first node the first, right of the last the last.
+    `reach` is for how many seconds before the horizon it needs measurements and inputs.
     """
-    nodes = trajectory.t
-    k = int(np.searchsorted(nodes, t, side="left"))
-    if k >= len(nodes):
-        return trajectory.x[-1]
-    if nodes[k] == t or k == 0:
-        return trajectory.x[k]
-    k -= 1
-    inputs, ends = (trajectory.u0[k], trajectory.u1[k]), (trajectory.x[k], trajectory.x[k + 1])
-    return _inside(stage, t, (nodes[k], nodes[k + 1]), ends, trajectory.w[k], trajectory.p, inputs)
+
+    reach: float
+
+    def begin(self, mhe: MHE, state: State) -> Memory:
+        """Return what is remembered at the start of estimation."""
+        ...
+
+    def at(self, mhe: MHE, state: State, start: float, growing: bool) -> Anchor | None:
+        """Return the prior of the window that starts at `start` (seconds), which is t0 while the window grows.
+
+        None where nothing is known there: in a gap longer than the horizon. The prior is then the prediction.
+        """
+        ...
+
+    def after(self, mhe: MHE, state: State, solved: Solved) -> Memory:
+        """Return what is remembered after a solve; `state` holds the new estimate already, and the memory before it."""
+        ...
+
+
+class Filtering:
+    """The estimated trajectory at the window's start: (3.18), (5.17), the initial estimate while the window grows."""
+
+    reach = 0.0
+
+    def begin(self, mhe: MHE, state: State) -> Memory:
+        """Return nothing: the state keeps the estimated trajectory in any case."""
+        return NOTHING
+
+    def at(self, mhe: MHE, state: State, start: float, growing: bool) -> Anchor | None:
+        """See `Prior`."""
+        if growing:
+            return Anchor(state.start)
+        slack = mhe.slack(state.t)
+        if start > state.t + slack:
+            return None
+        value = path_at(mhe.stage, state.path, min(start, state.t), slack)
+        return None if value is None else Anchor(value)
+
+    def after(self, mhe: MHE, state: State, solved: Solved) -> Memory:
+        """See `Prior`."""
+        return state.memory
+
+
+class Smoothing:
+    """The last solution at the window's start: (6.65), which is its second node when every step is solved.
+
+    The thesis has it in discrete time, solved at every step; on irregular instants this form is ours.
+    """
+
+    reach = 0.0
+
+    def begin(self, mhe: MHE, state: State) -> Memory:
+        """Return nothing: the state keeps the last solution in any case."""
+        return NOTHING
+
+    def at(self, mhe: MHE, state: State, start: float, growing: bool) -> Anchor | None:
+        """See `Prior`."""
+        if growing:
+            return Anchor(state.start)
+        if state.window is None or start > state.t + mhe.slack(state.t):
+            return None
+        last = state.window.trajectory
+        if start <= last.t[0] + mhe.slack(start):  # a solve that is repeated
+            return Anchor(frozen(state.window.part("prior")))
+        return Anchor(np.concatenate([trajectory_at(mhe.stage, last, start), last.p]))
+
+    def after(self, mhe: MHE, state: State, solved: Solved) -> Memory:
+        """See `Prior`."""
+        return state.memory
+
+
+class Turnpike:
+    """The first solution made half a horizon after the window's start, or later, there: (6.66).
+
+    That is about the middle of its window, far from both ends: near the turnpike. The thesis has it in discrete time,
+    solved at every step; on irregular instants this form is ours. Solutions are remembered as the trajectory that lags
+    by half a horizon.
+    """
+
+    reach = 0.0
+
+    def begin(self, mhe: MHE, state: State) -> Memory:
+        """See `Prior`."""
+        return {"turnpike": empty_path(mhe.stage)}
+
+    def at(self, mhe: MHE, state: State, start: float, growing: bool) -> Anchor | None:
+        """See `Prior`."""
+        if growing:
+            return Anchor(state.start)
+        slack = mhe.slack(state.t)
+        value = path_at(mhe.stage, state.memory["turnpike"], start, slack)
+        if value is not None:
+            return Anchor(value)
+        return SMOOTHING.at(mhe, state, start, growing)  # no solve in the last half of the horizon
+
+    def after(self, mhe: MHE, state: State, solved: Solved) -> Memory:
+        """See `Prior`."""
+        last, lag, slack = solved.trajectory, mhe.horizon / 2, mhe.slack(state.t)
+        since, until = max(state.since - lag, last.t[0]), state.t - lag
+        path = state.memory["turnpike"].drop_after(since)  # a solve that is repeated replaces its own piece
+        if until > since + slack:
+            path = path.extend(*lagged_rows(mhe.stage, last, since, until))
+        return {"turnpike": path.drop_before(state.t - mhe.horizon - slack)}
+
+
+SMOOTHING = Smoothing()
+PRIORS = {"filtering": Filtering(), "smoothing": SMOOTHING, "turnpike": Turnpike()}
+
+
+def prior_of(given: object) -> Prior:
+    """Return a prior given by name or as an object."""
+    if isinstance(given, str) and given in PRIORS:
+        return PRIORS[given]
+    if isinstance(given, type) or not isinstance(given, Prior):
+        raise InputError(
+            f"prior must be {', '.join(map(repr, PRIORS))}, or an object with reach, begin, at and after; got {given!r}"
+        )
+    return given

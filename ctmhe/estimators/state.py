@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from ctmhe.errors import InputError
 from ctmhe.transcription.solved import Layout, Solved
 from ctmhe.types import Array, frozen, made
 
-VERSION = 2
+VERSION = 3
 LOGS = ("measurements", "inputs", "path")
 
 
@@ -36,7 +37,7 @@ class State:
     measurements, inputs : Log
         What is still needed, ordered in time.
     path : Log
-        The estimated trajectory (3.16) over the last horizon, as rows of `priors.path_rows`.
+        The estimated trajectory (3.16) over the last horizon, as rows of `trajectories.path_rows`.
     since : float
         From when on the last estimate defines it.
     window : Solved or None
@@ -44,6 +45,8 @@ class State:
     solves : int
     prepared : object or None
         Says that the estimator has prepared the next estimate from this state; of no influence on its result.
+    memory : mapping name -> Log
+        What the prior remembers.
     track : Track or None
         What the next estimate's guaranteed bound needs of the past.
     doubts : tuple of (time, reason)
@@ -62,6 +65,7 @@ class State:
     window: Solved | None = None
     solves: int = 0
     prepared: object | None = None
+    memory: Mapping[str, Log] = field(default_factory=dict)
     track: Track | None = None
     doubts: tuple[tuple[float, str], ...] = ()
 
@@ -75,6 +79,8 @@ def save_state(state: State, path: str | Path, fingerprint: dict[str, Any]) -> N
     arrays: dict[str, Array] = {"start": state.start, "x": state.x, "p": state.p}
     for name in LOGS:
         arrays[f"{name}_t"], arrays[f"{name}_rows"] = getattr(state, name).arrays()
+    for name, log in state.memory.items():
+        arrays[f"memory_{name}_t"], arrays[f"memory_{name}_rows"] = log.arrays()
     if state.window is not None:
         arrays |= {"window_values": state.window.values, "window_active": state.window.active}
     header = {
@@ -87,6 +93,7 @@ def save_state(state: State, path: str | Path, fingerprint: dict[str, Any]) -> N
         "slots": None if state.window is None else state.window.n,
         "track": None if state.track is None else asdict(state.track),
         "doubts": state.doubts,
+        "memory": list(state.memory),
     }
     path = Path(path)
     temporary = path.with_name(path.name + ".part")
@@ -122,7 +129,7 @@ def load_state(path: str | Path, fingerprint: dict[str, Any], layout: Layout) ->
     track = header.get("track")
     if track is not None:
         track = Track(**track | {name: tuple(track[name]) for name in ("ends", "levels")})
-    logs = {name: Log.of(arrays[f"{name}_t"], rows := arrays[f"{name}_rows"], rows.shape[1]) for name in LOGS}
+    logs = {name: _log(arrays, name) for name in LOGS}
     return State(
         t0=header["t0"],
         t=header["t"],
@@ -132,7 +139,13 @@ def load_state(path: str | Path, fingerprint: dict[str, Any], layout: Layout) ->
         since=header["since"],
         window=window,
         solves=header["solves"],
+        memory={name: _log(arrays, f"memory_{name}") for name in header["memory"]},
         track=track,
         doubts=tuple((t, reason) for t, reason in header.get("doubts", ())),
         **logs,
     )
+
+
+def _log(arrays: Mapping[str, Array], name: str) -> Log:
+    rows = arrays[f"{name}_rows"]
+    return Log.of(arrays[f"{name}_t"], rows, rows.shape[1])

@@ -16,7 +16,7 @@ from ctmhe.errors import SolverError
 from ctmhe.solvers.tape import BATCH, tape_of
 from ctmhe.transcription.stage import StageFunction
 
-VERSION = 8
+VERSION = 9
 MAX_ARGUMENTS = 64
 CONVERGED, ITERATION_LIMIT, NOT_FINITE, NO_DECREASE, SINGULAR, DEADLINE = range(6)
 METHODS = {"step map": 0, "RK4": 1}
@@ -114,11 +114,16 @@ class RequestHeader(ctypes.Structure):
 
     _fields_ = [
         *((name, _double) for name in ("start", "end", "last_end", "since")),
-        *((name, _int) for name in ("growing", "capacity", "y_count", "u_count", "path_count", "last_n", "prepared")),
+        *(
+            (name, _int)
+            for name in (
+                "growing", "capacity", "y_count", "u_count", "path_count", "last_n", "prepared", "anchored",
+            )
+        ),
         *(
             (name, _pointer)
             for name in (
-                "y_t", "y", "u_t", "u", "path_t", "path", "prior", "p",
+                "y_t", "y", "u_t", "u", "path_t", "path", "prior", "p", "root_prior",
             )
         ),
         *((name, ctypes.c_char_p) for name in ("last", "last_active")),
@@ -128,7 +133,7 @@ class RequestHeader(ctypes.Structure):
 
 
 # One call for the fields that change from update to update: a field of a structure costs as much as five of them here.
-REQUESTED = Struct("4d 7i 8P")  # the request from `start` to `p`
+REQUESTED = Struct("4d 8i 9P")  # the request from `start` to `root_prior`
 WRITTEN, WRITTEN_AT = Struct("3i"), RequestHeader.n.offset  # the request from `n` on
 REACHED, REACHED_AT = Struct("3d 3i"), ResultHeader.cost.offset  # the result from `cost` on
 

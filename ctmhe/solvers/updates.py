@@ -70,9 +70,9 @@ class CompiledUpdates:
 
     @staticmethod
     def covers(assembly: Assembly) -> bool:
-        """Return whether an assembly's weights are constant and its terminal weight, if any, is diagonal."""
+        """Return whether an assembly's Q and R are constant and its terminal weight, if any, is diagonal."""
         weights = [weight for weight in (assembly.Q, assembly.R, assembly.R_point, assembly.S) if weight is not None]
-        if callable(assembly.cost.P) or not all(weight.constant for weight in weights):
+        if not all(weight.constant for weight in weights):
             return False
         return assembly.S is None or all(_diagonal(w.root(0.0)) for w in (assembly.S, assembly.R_point, assembly.R))
 
@@ -91,8 +91,9 @@ class CompiledUpdates:
         inputs: Log,
         path: Log,
         last: Solved | None,
-        known: tuple[Array, Array],
+        p: Array,
         times: tuple[float, float],
+        anchor: tuple[Array, Array | None] | None,
         ticket: object | None = None,
     ) -> Update | None:
         """Return the update of a window, None where the caller's own way has to be taken.
@@ -102,19 +103,22 @@ class CompiledUpdates:
         span : (start, end)
             Of the window, seconds.
         growing : bool
-            It starts at t0: the prior is the initial estimate.
+            It starts at t0.
         measurements, inputs, path : Log
         last : Solved or None
             The last solution.
-        known : (start (nx + np,), p (np,))
-            Initial estimate; parameters of the last one.
+        p : array (np,)
+            Parameters of the last estimate.
         times : (last, since)
             Time of the last estimate; from when on this one defines the estimated trajectory.
+        anchor : (prior (nx + np,), root (n, n) or None), optional
+            The prior and the square root of its weight, discount included; that of the cost where the root is None.
+            When left out, the prior is the filtering prior (3.18), read from the path.
         ticket : object, optional
             What `prepare` returned. Worth something only in the thread that prepared, and while nothing else was
             solved there; the result is the same without.
         """
-        arguments = (span, growing, measurements, inputs, path, last, known, times)
+        arguments = (span, growing, measurements, inputs, path, last, p, times, anchor)
         memory = self._memory()
         memory.prepared = ticket is not None and ticket is memory.ticket
         memory.ticket = None
@@ -166,6 +170,9 @@ class _Memory:
         width = 2 + 2 * self.stage.nx + self.stage.nw + 2 * self.stage.nu + self.stage.np
         self.path_times, self.path_rows = np.empty(capacity), np.empty((capacity, width))
         self.start, self.p = np.empty(self.stage.nx + self.stage.np), np.empty(self.stage.np)
+        width = self.stage.nx + (self.stage.np if assembly.p_estimated else 0)
+        self.root = np.empty((width, width))
+        self._root = self.root.ctypes.data
         request = self.request
         for name in ("values", "active", "path_times", "path_rows"):
             setattr(request, name, getattr(self, name).ctypes.data)
@@ -188,8 +195,9 @@ class _Memory:
         inputs: Log,
         path: Log,
         last: Solved | None,
-        known: tuple[Array, Array],
+        p: Array,
         times: tuple[float, float],
+        anchor: tuple[Array, Array | None] | None,
     ) -> int:
         """Write the request and call the core."""
         end = span[1]
@@ -200,15 +208,18 @@ class _Memory:
         if inputs.last_time > end:
             u_count = inputs.count_until(end, beyond=int(self.assembly.input_linear))
         path_times, rows, path_count = path.memory
-        if growing:
-            self.start[:] = known[0]
+        root = 0
+        if anchor is not None:
+            self.start[:] = anchor[0]
+            if anchor[1] is not None:
+                self.root[:], root = anchor[1], self._root
         if self.stage.np:
-            self.p[:] = known[1]
+            self.p[:] = p
         request = self.request
         request.last, request.last_active = NOTHING if last is None else last.blocks
         REQUESTED.pack_into(
             request, 0, *span, *times, growing, self.capacity, y_count, u_count, path_count, last.n if last else 0,
-            self.prepared, y_times, y, u_times, u, path_times, rows, *self._known,
+            self.prepared, anchor is not None, y_times, y, u_times, u, path_times, rows, *self._known, root,
         )  # fmt: skip
         return function()
 
@@ -265,7 +276,8 @@ def _estimator(assembly: Assembly) -> tuple[EstimatorHeader, list[np.ndarray]]:
     empty = np.empty((0, 0))
     arrays: dict[str, Any] = {
         "held": assembly.held, "linear": assembly.linear, "nodes": stage.nodes, "shares": stage.weights,
-        "root_P": assembly.prior_root(0.0, 0.0, 1.0), "root_Q": empty if assembly.Q is None else assembly.Q.root(0.0),
+        "root_P": empty if callable(assembly.cost.P) else assembly.prior_root(0.0, 0.0, 1.0),
+        "root_Q": empty if assembly.Q is None else assembly.Q.root(0.0),
         "root_R": assembly.R.root(0.0), "root_point": assembly.R_point.root(0.0),
         "root_S": empty if assembly.S is None else assembly.S.root(0.0),
     }  # fmt: skip

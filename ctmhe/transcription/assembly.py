@@ -91,11 +91,17 @@ class Assembly:
         self.boxes = {key: box_arrays(group, getattr(bounds, key), f"bounds {key}") for key, group in groups.items()}
         self.scales = {key: scale_of(groups[key], *self.boxes[key]) for key in "xwpy"}
 
-    def prior_root(self, start: float, length: float, factor: float) -> Array:
-        """Return the square root of the discounted prior weight at `start` for a window of `length` seconds."""
-        P = self.cost.P(start, length) if callable(self.cost.P) else self.cost.P
+    def prior_root(self, start: float, length: float, factor: float, weight: Array | None = None) -> Array:
+        """Return the square root of the discounted prior weight at `start` for a window of `length` seconds.
+
+        `weight` is that of a prior which has its own; else the cost's P.
+        """
+        P = self.cost.P if weight is None else weight
+        varies = callable(P) or weight is not None
         matrix = weight_matrix(
-            P, self.prior_names, f"cost weight P at t = {start:g}" if callable(self.cost.P) else "cost weight P"
+            P(start, length) if callable(P) else P,
+            self.prior_names,
+            f"weight P of the prior at t = {start:g}" if varies else "cost weight P",
         )
         return square_root(matrix) * np.sqrt(factor * np.exp(-self.prior_rate * length))
 
@@ -136,7 +142,15 @@ class Assembly:
         return Mesh(edges, h, np.zeros(len(h), dtype=bool), cell, tolerance)
 
     def window(
-        self, start: float, end: float, records: Records, prior: Array, *, growing: bool, prior_factor: float = 1.0
+        self,
+        start: float,
+        end: float,
+        records: Records,
+        prior: Array,
+        *,
+        growing: bool,
+        prior_factor: float = 1.0,
+        prior_weight: Array | None = None,
     ) -> Window:
         """Return the problem over [start, end] as arrays."""
         model, stage, mesh = self.model, self.stage, self.mesh(start, end, records, growing=growing)
@@ -162,7 +176,7 @@ class Assembly:
             u1=u1,
             prior=prior,
             p_estimated=self.p_estimated,
-            L_prior=self.prior_root(start, end - start, prior_factor),
+            L_prior=self.prior_root(start, end - start, prior_factor, prior_weight),
             L_w=self._disturbance_roots(mesh, end),
             L_y=L_y,
             y_data=y_data,

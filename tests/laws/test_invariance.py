@@ -254,9 +254,9 @@ def test_the_truth_never_costs_less_than_the_estimate(rng):
     checked = 0
     for t in (0.33, 0.57, 0.93):
         start = max(0.0, round(t - 0.5, 10))
-        prior, factor, _ = mhe._prior(state, max(0.0, t - 0.5), t <= 0.5)
+        anchor = mhe._prior(state, max(0.0, t - 0.5), t <= 0.5)
         window = mhe.assembly.window(
-            start, t, mhe._records(state, t, start), prior, growing=t <= 0.5, prior_factor=factor
+            start, t, mhe._records(state, t, start), anchor.value, growing=t <= 0.5, prior_factor=anchor.factor
         )
         true_w = w[window.mesh.cell]
         point = rollout(mhe.stage, window, truth[start], np.empty(0), true_w)

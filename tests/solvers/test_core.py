@@ -65,10 +65,10 @@ def compiled(compiler: str, source: Path, *flags: str) -> bytes:
 
 def window_of(mhe: MHE, state, end: float) -> tuple[Window, Guess]:
     """The window that `estimate` would solve, and its last guess."""
-    prior, factor, _ = mhe._prior(state, max(end - mhe.horizon, 0.0), end <= mhe.horizon)
+    anchor = mhe._prior(state, max(end - mhe.horizon, 0.0), end <= mhe.horizon)
     start = max(end - mhe.horizon, 0.0)
     records = mhe._records(state, end, start)
-    window = mhe.assembly.window(start, end, records, prior, growing=end <= mhe.horizon, prior_factor=factor)
+    window = mhe.assembly.window(start, end, records, anchor.value, growing=end <= mhe.horizon)
     return window, shifted_guess(mhe.stage, window)
 
 

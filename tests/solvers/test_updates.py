@@ -62,6 +62,18 @@ CASES = {
         dict(hold={"one": "zero", "two": "point"}, hold_limit=0.2, bounds=Bounds(p=(0.5, 4.0), w={"v": (-1, 1)}),
              cost=DiscountedCost(P=np.diag([1.0, 1.0, 2.0]), prior_eta=0.9, S=[1.0, 4.0], **COMMON)),
     ),
+    "smoothing prior, varying weight": lambda: (
+        two_outputs(parameter=True),
+        dict(prior="smoothing", bounds=Bounds(p=(0.5, 4.0)), hold="point",
+             cost=DiscountedCost(P=lambda start, length: np.diag([1.0, 1.0, 2.0 + np.sin(start) + length]), **COMMON)),
+    ),
+    "turnpike prior": lambda: (
+        two_outputs(),
+        dict(prior="turnpike", input_hold="linear", cost=DiscountedCost(P=1.0, **COMMON)),
+    ),
+    "steps, turnpike prior": lambda: (
+        step_model(), dict(prior="turnpike", cost=DiscountedCost(P=1.0, Q=2.0, R=[3.0, 1.0], eta=0.9)),
+    ),
     "correlated": lambda: (
         two_outputs(),
         dict(hold="zero", cost=DiscountedCost(P=[[2, 1], [1, 2]], Q=[[2, 1], [1, 2]], R=[[2, 1], [1, 2]])),
@@ -87,8 +99,9 @@ def estimator(name: str) -> MHE:
 def request(mhe: MHE, state, t: float):
     """What `estimate` would ask the core for."""
     logs = (state.measurements, state.inputs, state.path)
-    known, times = (state.start, state.p), (state.t, state.t)
-    return mhe._updates.assembled(*mhe._span(state, t), *logs, state.window, known, times)
+    span, growing = mhe._span(state, t)
+    anchor = mhe._anchor(state, span, growing)[0]
+    return mhe._updates.assembled(span, growing, *logs, state.window, state.p, (state.t, state.t), anchor)
 
 
 def compare(mhe: MHE, state, t: float) -> None:

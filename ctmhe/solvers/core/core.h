@@ -17,7 +17,7 @@
 extern "C" {
 #endif
 
-#define CTMHE_CORE_VERSION 8
+#define CTMHE_CORE_VERSION 9
 #define CTMHE_BATCH 8          /* slots that a tape is run for at once */
 #define CTMHE_MAX_ARGUMENTS 64 /* pointers a compiled stage function may use (CasADi's sz_arg, sz_res) */
 
@@ -145,14 +145,16 @@ typedef struct {              /* an estimator: what does not change from update 
 typedef struct {              /* one update: what is known, and where the results go */
   double start, end;          /* of the window, seconds */
   double last_end, since;     /* time of the last estimate; from when on this one defines the estimated trajectory */
-  int growing;                /* the window starts at t0: the prior is `prior` */
+  int growing;                /* the window starts at t0 */
   int capacity;               /* slots that there is room for */
   int y_count, u_count, path_count, last_n;
   int prepared;               /* the scratch is as ctmhe_prepare left it */
+  int anchored;               /* the prior is `prior`, not the estimated trajectory at the start (3.18) */
   const double *y_t, *y;      /* (y_count), (y_count, ny) measurements up to the end, NaN missing */
   const double *u_t, *u;      /* (u_count), (u_count, nu) inputs */
   const double *path_t, *path; /* (path_count), (path_count, width): the estimated trajectory, a slot a row */
   const double *prior, *p;    /* (nx + np), (np) of the last estimate */
+  const double *root_prior;   /* square root of the prior's weight, discount included; NULL: that of the estimator */
   const double *last;         /* the last solution's blocks, or NULL */
   const int8_t *last_active;
   double *values;             /* out: blocks in the order of solved.py */
