@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import casadi as ca
 import numpy as np
 from scipy.optimize import nnls
 
 from ctmhe.errors import InputError
 from ctmhe.solvers.base import Solution, Solver
+from ctmhe.transcription.integrators import is_symbolic
 from ctmhe.transcription.problem import Guess, Window, cost_of
 from ctmhe.transcription.stage import StageFunction
 from ctmhe.transcription.weights import square_root
@@ -63,79 +65,81 @@ class _Turns:
 
     def __init__(self, stage: StageFunction, inner: Solver, rule: DualIterations):
         self.stage, self.inner, self.rule = stage, inner, rule
+        self.affine = stage.model.step is not None and _is_affine(stage)
 
     def solve(self, window: Window, guess: Guess) -> Solution:
         """Return where the iterations end: a trajectory of the mixture whose weights it carries."""
-        stage, notes = self.stage, ()
-        mixed = window.p_estimated and stage.np > 0
-        alpha = guess.p
+        nx, notes = self.stage.nx, ()
+        mixed = window.p_estimated and self.stage.np > 0
         if mixed:
-            alpha, moved = _projected(alpha)
-            prior, off = _projected(window.prior[stage.nx :])
-            window = replace(window, prior=np.concatenate([window.prior[: stage.nx], prior]))
+            alpha, moved = _projected(guess.p)
+            prior, off = _projected(window.prior[nx:])
+            window = replace(window, prior=np.concatenate([window.prior[:nx], prior]))
+            guess = replace(guess, p=alpha)
             if moved or off:
                 notes = ("mixing weights off the simplex: projected onto it",)
-        solution = self._states(window, guess, alpha)
+        P = window.L_prior.T @ window.L_prior
+        split = square_root(P[:nx, :nx]), np.linalg.pinv(P[:nx, :nx], hermitian=True) @ P[:nx, nx:]
+        solution = self._states(window, split, guess)
         before, count, last = solution.cost, 0, False
+        cells = np.concatenate([[0], np.cumsum(~window.mesh.shared[:-1])])
         while mixed and solution.success and count < self.rule.iterations:
             count += 1
-            point, y = self._weights(window, solution.point)
-            total = cost_of(window, point, y)
+            point, y, total = self._weights(window, cells, solution)
             last = before - total <= self.rule.tolerance * before
             before, solution = total, replace(solution, point=point, y=y, cost=total)
             if last or count == self.rule.iterations:
                 break
-            solution = self._states(window, point, point.p)
+            solution = self._states(window, split, point)
         if not solution.success:
             return solution
-        total = solution.cost
         known = int(np.count_nonzero(np.diagonal(window.L_y, axis1=2, axis2=3)))
-        if known and total > self.rule.misfit * known:
-            notes += (
-                f"no mixture explains the window: cost {total:.3g} for {known} numbers; widen the polytope or Q and R",
-            )
+        if known and solution.cost > self.rule.misfit * known:
+            said = f"cost {solution.cost:.3g} for {known} numbers; widen the polytope or lower Q and R"
+            notes += (f"no mixture explains the window: {said}",)
         converged = last or not mixed
         message = "converged" if converged else f"{count} dual iterations"
         stopped = None if converged else Outcome.ITERATION_LIMIT
         return replace(solution, iterations=count, message=message, success=converged, stopped=stopped, notes=notes)
 
-    def _states(self, window: Window, guess: Guess, alpha: Array) -> Solution:
-        """Solve (10): states and disturbances for given weights."""
+    def _states(self, window: Window, split: tuple[Array, Array], guess: Guess) -> Solution:
+        """Solve (10): states and disturbances for the weights of `guess`; `split` is what the prior says of states."""
         if not window.p_estimated:
             return self.inner.solve(window, guess)
-        nx = self.stage.nx
-        P = window.L_prior.T @ window.L_prior
-        offset = np.linalg.pinv(P[:nx, :nx], hermitian=True) @ P[:nx, nx:] @ (alpha - window.prior[nx:])
-        prior = np.concatenate([window.prior[:nx] - offset, alpha])
-        known = replace(window, p_estimated=False, prior=prior, L_prior=square_root(P[:nx, :nx]))
-        solution = self.inner.solve(known, replace(guess, p=alpha))
+        nx, (root, coupling) = self.stage.nx, split
+        prior = np.concatenate([window.prior[:nx] - coupling @ (guess.p - window.prior[nx:]), guess.p])
+        known = replace(window, p_estimated=False, prior=prior, L_prior=root)
+        solution = self.inner.solve(known, guess)
         return replace(solution, cost=cost_of(window, solution.point, solution.y))
 
-    def _weights(self, window: Window, point: Guess) -> tuple[Guess, Array]:
-        """Solve (11): weights for given states at the edges of cells, never with a larger cost."""
-        cells = _cells(window)
-        found, r, J = self._followed(window, point, cells, point.p)
+    def _weights(self, window: Window, cells: np.ndarray, solution: Solution) -> tuple[Guess, Array, float]:
+        """Solve (11): weights for given states at the edges of cells. Return point, outputs and cost, never larger."""
+        point, slack = solution.point, 1e-12 * window.w_scale
+        found, r, J, by_alpha = self._followed(window, point, cells, point.p)
         before = cost_of(window, *found)
-        target = simplex_least_squares(J, J @ point.p - r)
-        share = 1.0
-        for _ in range(30):  # the first is the best where the model is affine in the weights, as one of steps is
-            try:
-                trial, _, _ = self._followed(window, point, cells, point.p + share * (target - point.p))
-            except FloatingPointError:
-                trial = None
-            if trial is not None and cost_of(window, *trial) <= before:
-                w, slack = trial[0].w, 1e-12 * window.w_scale
-                if ((w >= window.w_lower - slack) & (w <= window.w_upper + slack)).all():
-                    return trial
-            share /= 2
-        return found
+        move = simplex_least_squares(J, J @ point.p - r) - point.p
+        for share in 0.5 ** np.arange(30):  # where the model is affine in the weights the whole move is best
+            step = share * move
+            if self.affine:
+                guess, y = found
+                w = guess.w + (by_alpha[0] @ step[:, None])[..., 0]
+                trial = replace(guess, w=w, p=guess.p + step), y + (by_alpha[1] @ step[:, None])[..., 0]
+            else:
+                try:
+                    trial = self._followed(window, point, cells, point.p + step)[0]
+                except FloatingPointError:
+                    continue
+            w, total = trial[0].w, cost_of(window, *trial)
+            if total <= before and ((w >= window.w_lower - slack) & (w <= window.w_upper + slack)).all():
+                return *trial, total
+        return *found, before
 
     def _followed(
         self, window: Window, point: Guess, cells: np.ndarray, alpha: Array
-    ) -> tuple[tuple[Guess, Array], Array, Array]:
-        """Return the trajectory of some weights through the states at the edges of cells, its residuals and Jacobian.
+    ) -> tuple[tuple[Guess, Array], Array, Array, tuple[Array, Array]]:
+        """Return the trajectory of some weights through the states at the edges of cells, residuals and Jacobian.
 
-        The disturbance of a cell is what leads to the next edge: the model is linear in it. `cells` (N,) numbers them.
+        Last come the derivatives of w and y by the weights. The disturbance of a cell is what leads to the next edge: the model is linear in it. `cells` (N,) numbers them.
         """
         stage, mesh, n = self.stage, window.mesh, len(window.mesh)
         nx, nw, q = stage.nx, stage.nw, stage.np
@@ -178,7 +182,7 @@ class _Turns:
         rows = (window.L_prior[:, nx:], window.L_w @ w_alpha[cells], window.L_y @ y_alpha)
         r, J = (np.concatenate([part.reshape(-1, m) for part in parts]) for parts, m in ((residuals, 1), (rows, q)))
         active = (point.x_active, point.w_active, point.y_active, point.p_active)
-        return (Guess(x, w, alpha, *active), y), r[:, 0], J
+        return (Guess(x, w, alpha, *active), y), r[:, 0], J, (w_alpha[cells], y_alpha)
 
 
 def simplex_least_squares(J: Array, b: Array) -> Array:
@@ -188,14 +192,19 @@ def simplex_least_squares(J: Array, b: Array) -> Array:
     the one sought, whatever the size of D: along a ray the best multiple costs f / (1 + f), which grows with f.
     """
     D = J - b[:, None]
-    D = D / max(float(np.linalg.norm(D, 2)), 1e-300)
+    D = D / max(float(np.linalg.norm(D)), 1e-300)
     a, _ = nnls(np.vstack([D, np.ones(D.shape[1])]), np.append(np.zeros(len(D)), 1.0))
     return a / a.sum()
 
 
-def _cells(window: Window) -> np.ndarray:
-    """Return the number of each slot's disturbance cell (N,), from 0 on."""
-    return np.concatenate([[0], np.cumsum(~window.mesh.shared[:-1])])
+def _is_affine(stage: StageFunction) -> bool:
+    """Return whether steps and outputs are affine in the parameters for given states."""
+    model = stage.model
+    if not is_symbolic(model):
+        return False
+    symbols = [ca.SX.sym(name, model.output.size1_in(i)) for i, name in enumerate("txuwp")]
+    both = ca.vertcat(model.dynamics(*symbols), model.output(*symbols))
+    return not any(ca.which_depends(both, symbols[4], 2, False)) if stage.np else True
 
 
 def _projected(alpha: Array) -> tuple[Array, bool]:

@@ -4,6 +4,13 @@ from ctmhe.models.library.batch_reactor import batch_reactor
 from ctmhe.models.library.cascaded_tanks import cascaded_tanks
 from ctmhe.models.library.chua import chua, chua_discrete
 from ctmhe.models.library.cstr import cstr, cstr_steady_states
+from ctmhe.models.library.polytopes import (
+    drifting_sine,
+    sine_drift,
+    sine_polytope,
+    unknown_linear,
+    unknown_linear_matrices,
+)
 from ctmhe.models.library.quadrotor import hover_speed, quadrotor
 from ctmhe.models.library.three_species import three_species, three_species_discrete
 from ctmhe.models.library.van_der_pol import van_der_pol
@@ -15,9 +22,14 @@ __all__ = [
     "chua_discrete",
     "cstr",
     "cstr_steady_states",
+    "drifting_sine",
     "hover_speed",
     "quadrotor",
+    "sine_drift",
+    "sine_polytope",
     "three_species",
     "three_species_discrete",
+    "unknown_linear",
+    "unknown_linear_matrices",
     "van_der_pol",
 ]

@@ -59,9 +59,7 @@ def one_seed(seed: int, steps: int = STEPS) -> dict[str, dict[str, float]]:
             until=steps * STEP,
             guess=GUESS,
             truth=TRUTH,
-            disturbance={
-                label: Uniform(size, interval=STEP) for label, size in zip(names, SIZES.values(), strict=True)
-            },
+            disturbance=noise,
             seed=seed,
         )
         error = run.dataset["x_hat"].values - run.dataset["x_true_solve"].values
