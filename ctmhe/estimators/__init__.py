@@ -1,6 +1,30 @@
 """Estimators on explicit state."""
 
+from ctmhe.estimators.base import Estimator
+from ctmhe.estimators.filter import Filter
+from ctmhe.estimators.filter_state import FilterState
+from ctmhe.estimators.kalman import Extended, Kalman
+from ctmhe.estimators.luenberger import Luenberger
 from ctmhe.estimators.mhe import MHE, Prediction
+from ctmhe.estimators.polytopic import AdaptiveArrival, dual_iterations, polytopic_horizon
+from ctmhe.estimators.robust_kalman import RobustKalman, norm_bounded
 from ctmhe.estimators.state import State
+from ctmhe.estimators.unscented import Unscented
 
-__all__ = ["MHE", "Prediction", "State"]
+__all__ = [
+    "MHE",
+    "AdaptiveArrival",
+    "Estimator",
+    "Extended",
+    "Filter",
+    "FilterState",
+    "Kalman",
+    "Luenberger",
+    "Prediction",
+    "RobustKalman",
+    "State",
+    "Unscented",
+    "dual_iterations",
+    "norm_bounded",
+    "polytopic_horizon",
+]

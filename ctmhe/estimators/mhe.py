@@ -17,6 +17,7 @@ from ctmhe.certificates.guarantee import Guarantee
 from ctmhe.data.log import Log
 from ctmhe.data.window import held_inputs
 from ctmhe.errors import InputError, NotEstimated, TooLate
+from ctmhe.estimators.base import check_wait
 from ctmhe.estimators.guaranteed import Guaranteed
 from ctmhe.estimators.guesses import open_loop, resting_guess, starting_points
 from ctmhe.estimators.outlook import carried_covariance, prior_covariance
@@ -27,6 +28,7 @@ from ctmhe.models.continuous import Model
 from ctmhe.models.signals import Signals
 from ctmhe.solvers.base import Solution, Solver
 from ctmhe.solvers.compiled import compiled_solver
+from ctmhe.solvers.dual import DualIterations
 from ctmhe.solvers.gauss_newton import GaussNewton
 from ctmhe.solvers.ipopt import Ipopt
 from ctmhe.solvers.ladder import climb
@@ -121,7 +123,7 @@ class MHE:
         The longest wait between estimates, if declared; must be shorter than the horizon (3.19).
     guarantee : Guarantee, optional
         A certificate and how large disturbances are: every estimate then has a `bound`, or says why not.
-    solver : {"gauss-newton", "numpy", "ipopt"}
+    solver : {"gauss-newton", "numpy", "ipopt"} or DualIterations
         `gauss-newton` runs in the compiled core; `numpy` is the same method in Python, which also takes over where
         there is no core; `ipopt` is the reference.
     compile : {"auto", "off"}, optional
@@ -165,7 +167,7 @@ class MHE:
         delay: float | None = None,
         longest_wait: float | None = None,
         guarantee: Guarantee | None = None,
-        solver: str = "gauss-newton",
+        solver: str | DualIterations = "gauss-newton",
         compile: str | None = None,
         tolerance: float | None = None,
         max_iterations: int | None = None,
@@ -209,10 +211,11 @@ class MHE:
         self.cost = cost
         self.longest_wait = longest_wait
         if longest_wait is not None:
-            self.check_wait(positive("longest_wait", longest_wait, "seconds"))
+            check_wait(self.horizon, positive("longest_wait", longest_wait, "seconds"))
         self.delay = None if delay is None else self._checked_delay(delay)
-        if solver not in SOLVERS:
-            raise InputError(f"solver must be one of {', '.join(SOLVERS)}, got {solver!r}")
+        dual = solver if isinstance(solver, DualIterations) else None
+        if dual is None and solver not in SOLVERS:
+            raise InputError(f"solver must be one of {', '.join(SOLVERS)} or DualIterations(...), got {solver!r}")
         self.hold_limit = self.horizon if hold_limit is None else positive("hold_limit", hold_limit, "seconds")
         # what the core does by itself: the filtering prior with one weight
         self._plain_prior = type(self.prior) is Filtering and not callable(cost.P)
@@ -243,14 +246,16 @@ class MHE:
             raise InputError(f"compile must be 'off' or 'auto', got {compile!r}")
         self._solver: Solver = self._reference if solver == "ipopt" else self._gauss_newton
         compiled = None
-        if solver == "gauss-newton":
-            choice = {"specialise": compile == "auto", "p_estimated": self.assembly.p_estimated}
+        if solver == "gauss-newton" or dual:
+            choice = {"specialise": compile == "auto" and not dual, "p_estimated": self.assembly.p_estimated}
             compiled = compiled_solver(self.stage, **choice, **limits)
             self._solver = compiled or self._gauss_newton
         self._covariance = (compiled or self._gauss_newton).covariance
         self._layout = Layout.of(self.stage)
         self._updates = None
-        if compiled is not None and CompiledUpdates.covers(self.assembly):
+        if dual is not None:
+            self._solver, self._real_time = dual.on(self.stage, self._solver), True
+        elif compiled is not None and CompiledUpdates.covers(self.assembly):
             self._updates = CompiledUpdates(compiled, self.assembly, self._layout, real_time=self._real_time)
         self._check = Ipopt(self.stage, options={"ipopt.mu_init": 1e-8}) if verify else None
         self._holds = bool(self.assembly.held.any())
@@ -284,15 +289,15 @@ class MHE:
             raise InputError(f"MHE has no argument {unknown[0]!r}. Known: {', '.join(self._configuration)}")
         return _rebuild(self._configuration | configuration)
 
-    def check_wait(self, wait: float) -> None:
-        """Raise `InputError` unless a declared longest wait between estimates is shorter than the horizon (3.19)."""
-        if not wait < self.horizon:
-            raise InputError(
-                f"the declared longest wait of {wait:g} s is not shorter than the horizon of "
-                f"{self.horizon:g} s: the prior at the "
-                "window's edge would not be estimated yet (thesis 3.19). Lengthen the horizon or bound the wait, "
-                "for example with | MaxInterval(...)"
-            )
+    @property
+    def p_estimated(self) -> bool:
+        """Whether the prior's weight covers the parameters."""
+        return self.assembly.p_estimated
+
+    @property
+    def input_linear(self) -> bool:
+        """Whether inputs are interpolated between their samples."""
+        return self.assembly.input_linear
 
     def init(self, *, t: float = 0.0, x: Any, p: Any = None) -> State:
         """Return the state at the start of estimation.

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ctmhe.errors import CtmheError, FmuUnsupportedError, InputError, TriggerError
+from ctmhe.estimators.base import Estimator, check_wait
 from ctmhe.estimators.mhe import MHE
 from ctmhe.models.signals import Signals
 from ctmhe.simulation.channel import Channel, Delivery, Everything, WholeSignal, check_hold
@@ -83,7 +84,7 @@ class Loop:
     def __init__(
         self,
         plant: Plant,
-        mhe: MHE,
+        estimator: Estimator,
         *,
         trigger: Trigger,
         channel: Channel,
@@ -95,12 +96,13 @@ class Loop:
         locate: float | None,
         sample_time: Callable[[], float] | None = None,
     ):
-        self.plant, self.mhe, self.model = plant, mhe, mhe.model
+        self.plant, self.configured, self.model = plant, estimator, estimator.model
+        self.certified = estimator if isinstance(estimator, MHE) and estimator.guaranteed is not None else None
         self.watch = Watch(trigger)
         if np.isfinite(trigger.longest_wait):
-            mhe.check_wait(trigger.longest_wait)
+            check_wait(estimator.horizon, trigger.longest_wait)
         if self.model.step is None:
-            check_hold(channel, mhe.hold, self.model.y.names)
+            check_hold(channel, estimator.hold, self.model.y.names)
         self.y_map = matched(self.model.y, plant.y, "plant", plant.name)
         self.u_map = matched(self.model.u, plant.u, "plant", plant.name)
         self.channel, self.link = channel, channel.open(seed, self.model.y.names)
@@ -111,7 +113,7 @@ class Loop:
         self.times, self.monitor, self.seed = times, monitor, seed
         self.locate = locate if self.watch.has_guard else None
         self.rooted = self.locate is not None and getattr(plant, "finds_roots", False)
-        self.parameters = self.model.p.names if mhe.assembly.p_estimated else ()
+        self.parameters = self.model.p.names if estimator.p_estimated else ()
         self.recorder = Recorder(self)
 
     def run(self, *, truth: Any, p_true: Any, guess: Any, p: Any, progress: bool) -> Run:
@@ -120,8 +122,8 @@ class Loop:
         x = truth if truth is None else plant.x.vector(truth, "truth")
         plant.start(start, x, p_true)
         self._check_way_back()
-        self.estimator = Follower(self.mhe, self.mhe.init(t=start, x=guess, p=p))
-        self.sensor = self.estimator if self.channel.faithful else Follower(self.mhe, self.estimator.state)
+        self.estimator = Follower(self.configured, self.configured.init(t=start, x=guess, p=p))
+        self.sensor = self.estimator if self.channel.faithful else Follower(self.configured, self.estimator.state)
         self.followers = (self.estimator,) if self.channel.faithful else (self.estimator, self.sensor)
         unsent = frozen(np.full(len(self.model.y), np.nan))
         self.now = Progress(start, WatchState(()), unsent, start)
@@ -143,7 +145,7 @@ class Loop:
 
     def _against_guarantees(self) -> list[str]:
         """Return what stands against a guarantee of the estimator: less than the whole signal, or later."""
-        if self.mhe.guaranteed is None:
+        if self.certified is None:
             return []
         network = self.channel if isinstance(self.channel, Network) else None
         inner = network.channel if network else self.channel
@@ -154,8 +156,8 @@ class Loop:
 
     def _doubt(self, t: float, reason: str) -> None:
         """Let the estimator know that its data at `t` are not what a guarantee assumes."""
-        if self.mhe.guaranteed is not None:
-            self.estimator.state = self.mhe.doubt(self.estimator.state, t, reason)
+        if self.certified is not None:
+            self.estimator.state = self.certified.doubt(self.estimator.state, t, reason)
 
     def _check_way_back(self) -> None:
         """Raise when events are to be located by going back, and the plant cannot."""
@@ -261,10 +263,9 @@ class Loop:
         if fired or grid == 0:
             self.segment = self._segment(segment.b)  # policies may have named earlier times
         if grid is not None:
-            start = self.estimator.state.start[: len(self.model.x)]
             for follower in self.followers:
                 follower.carry(now.t)
-            x_online = start if grid == 0 else self.estimator.forecast.x
+            x_online = self.estimator.guess if grid == 0 else self.estimator.forecast.x
             level = max(level, 0.0) if crossed else level
             self.recorder.monitored(grid, self.plant.state(), x_online, y, level, segment)
 

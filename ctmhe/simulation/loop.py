@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ctmhe.errors import InputError
-from ctmhe.estimators.mhe import MHE
+from ctmhe.estimators.base import Estimator
 from ctmhe.models.continuous import Model
 from ctmhe.simulation.channel import Channel, WholeSignal
 from ctmhe.simulation.engine import Loop
@@ -21,7 +21,7 @@ from ctmhe.types import Array, finite_time, frozen
 
 def simulate(
     plant: Plant | Model,
-    mhe: MHE,
+    estimator: Estimator,
     *,
     trigger: Trigger,
     until: float,
@@ -58,7 +58,8 @@ def simulate(
     plant : Plant or Model
         A model is integrated by `OdePlant` (`MapPlant` when discrete). Signals are matched with the estimator's by
         name. It is started anew and left open.
-    mhe : MHE
+    estimator : Estimator
+        `MHE`, a `KalmanFilter`, or anything else with their verbs.
     trigger : Trigger
     until : float
         End of the run, seconds.
@@ -110,7 +111,7 @@ def simulate(
     start, until = finite_time(start, "simulate: start"), finite_time(until, "simulate: until")
     if not until > start:
         raise InputError(f"simulate: until = {until:g} s must come after start = {start:g} s")
-    step = plant.step if isinstance(plant, MapPlant) else mhe.model.step
+    step = plant.step if isinstance(plant, MapPlant) else estimator.model.step
     if monitor is None:
         monitor = 0.01 if step is None else step
     monitor = finite_time(monitor, "simulate: monitor")
@@ -123,7 +124,7 @@ def simulate(
         inputs = getattr(plant, "u_start", getattr(getattr(plant, "model", None), "u_start", None))
     loop = Loop(
         plant,
-        mhe,
+        estimator,
         trigger=trigger,
         channel=channel or WholeSignal(),
         disturbance=bind_disturbance(disturbance, plant.w, number),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ctmhe.estimators.mhe import MHE
 from ctmhe.models.signals import Signals
 from ctmhe.simulation.channel import WholeSignal
 from ctmhe.simulation.run import FORMAT, Run
@@ -65,10 +66,11 @@ class Recorder:
             "w": np.full((n, len(plant.w)), np.nan),
             "level": np.full(n, np.nan),
         }
-        self.guaranteed = loop.mhe.guaranteed
+        self.guaranteed = None if loop.certified is None else loop.certified.guaranteed
         if self.guaranteed is not None:
             self.grid["retro_level"] = np.full(n, np.nan)
-        self.delay = loop.mhe.delay
+        self.mhe = loop.configured if isinstance(loop.configured, MHE) else None
+        self.delay = None if self.mhe is None else self.mhe.delay
         if self.delay is not None:
             self.grid["x_delayed"] = np.full((n, len(model.x)), np.nan)
         self.rows = 0
@@ -122,12 +124,13 @@ class Recorder:
         start, stop = np.searchsorted(self.times, [first + slack, t + slack], side="right")
         for k in range(start, stop):
             at = min(float(self.times[k]), t)
-            self.grid["x_retro"][k] = self.loop.mhe.trajectory(state, at)
+            self.grid["x_retro"][k] = self.loop.configured.trajectory(state, at)
             if self.guaranteed is not None and estimate.bound is not None and estimate.bound.level is not None:
                 self.grid["retro_level"][k] = self.guaranteed.bounds.at(state.track, at)
 
     def _keep_delayed(self, state: Any, estimate: Estimate, previous: float, t: float, delay: float) -> None:
         """Append the piece of the delayed trajectory that this window is the first to know: (previous, t] - delay."""
+        assert self.mhe is not None
         slack = tolerance(t)
         since = previous - delay
         if since <= self.times[0]:
@@ -136,7 +139,7 @@ class Recorder:
         start = np.searchsorted(self.times, max(since + slack, window - slack), side="right")
         stop = np.searchsorted(self.times, t - delay + slack, side="right")
         for k in range(start, stop):
-            self.grid["x_delayed"][k] = self.loop.mhe.smooth(state, float(self.times[k]))
+            self.grid["x_delayed"][k] = self.mhe.smooth(state, float(self.times[k]))
 
     def finish(self, p_true: Any) -> Run:
         """Return the run as far as it went."""
@@ -196,12 +199,12 @@ class Recorder:
             "plant": plant.name,
             "integrator": plant.integrator,
             "model": model.name,
-            "estimator": repr(loop.mhe),
+            "estimator": repr(loop.configured),
             "trigger": repr(loop.watch.policy),
             "channel": repr(loop.channel),
             "location": self._location(),
             "monitor": float(loop.monitor),
-            "horizon": float(loop.mhe.horizon),
+            "horizon": float(loop.configured.horizon),
             **({} if self.delay is None else {"delay": self.delay}),
             "seed": str(loop.seed),
             "measurements": int(loop.estimator.taken),
@@ -227,7 +230,7 @@ class Recorder:
             "P_lower": P.reshape(-1),
             "domain_level": bounds.cap,
             "wait_limit": bounds.limit,
-            "holds": ", ".join(sorted(set(self.loop.mhe.hold.values()))),
+            "holds": ", ".join(sorted(set(self.loop.configured.hold.values()))),
             "records_at_events": int(isinstance(channel, WholeSignal)),
         }
 

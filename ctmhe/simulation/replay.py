@@ -8,7 +8,7 @@ import numpy as np
 
 from ctmhe.data.log import MeasurementLog
 from ctmhe.errors import InputError
-from ctmhe.estimators.mhe import MHE
+from ctmhe.estimators.base import Estimator
 from ctmhe.models.continuous import Model
 from ctmhe.models.fmu import FmuModel
 from ctmhe.models.fmu.units import conversion, instruction, known_unit
@@ -89,7 +89,7 @@ class RecordedPlant:
 
 def replay(
     log: MeasurementLog,
-    mhe: MHE,
+    estimator: Estimator,
     *,
     trigger: Trigger,
     guess: Any,
@@ -108,7 +108,8 @@ def replay(
     ----------
     log : MeasurementLog
         Columns are matched with the model's outputs and inputs by name; an output without a column is missing.
-    mhe : MHE
+    estimator : Estimator
+        `MHE`, a `KalmanFilter`, or anything else with their verbs.
     trigger : Trigger
     guess : array (nx,) or mapping
         Initial estimate at the first row.
@@ -137,15 +138,15 @@ def replay(
     times = log.t[(log.t >= low) & (log.t <= high)]
     if len(times) < 2:
         raise InputError(f"replay: the log has {len(times)} rows between {low:g} and {high:g} s; at least 2 are needed")
-    model = mhe.model
+    model = estimator.model
     check_units(log, model)
     plant = RecordedPlant(log, model.y, model.u)
     columns = [log.inputs.index(name) for name in model.u]
     if channel is None:
-        channel = SingleSample() if set(mhe.hold.values()) == {"point"} and model.step is None else WholeSignal()
+        channel = SingleSample() if set(estimator.hold.values()) == {"point"} and model.step is None else WholeSignal()
     loop = Loop(
         plant,
-        mhe,
+        estimator,
         trigger=trigger,
         channel=channel,
         disturbance=bind_disturbance(None, plant.w, 0),

@@ -37,6 +37,8 @@ class Solution:
         Of the dynamics and the bounds, in scaled variables, for the cost J / 2.
     stopped : Outcome or None
         The limit (of iterations, of time) that ended a solve which was still making progress.
+    notes : tuple of str
+        Facts for the status.
     """
 
     point: Guess
@@ -50,6 +52,7 @@ class Solution:
     factorizations: int = 0
     multipliers: Multipliers | None = None
     stopped: Outcome | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -110,6 +110,6 @@ def _status(outcome: Outcome, solution: Solution, rungs: Sequence[str], notes: t
         solution.feasibility,
         0.0,
         tuple(rungs),
-        notes,
+        (*notes, *solution.notes),
         solution.factorizations,
     )

@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import casadi as ca
 import numpy as np
 
+from ctmhe.errors import InputError
 from ctmhe.models.continuous import Model
 from ctmhe.transcription.sensitivities import step_symbols, step_with_sensitivities
 from ctmhe.types import Array, positive
@@ -145,6 +146,86 @@ class CVODES:
     def _flow(self, problem: dict[str, Any], grid: Sequence[float]) -> ca.Function:
         options = {"reltol": self.rtol, "abstol": self.atol, "max_num_steps": 10_000}
         return ca.integrator("flow", "cvodes", problem, 0.0, list(grid), options)
+
+
+@dataclass(frozen=True)
+class Exact:
+    """The matrix exponential, for models that are linear in x, w and u and do not depend on time.
+
+    A step of h seconds is the Taylor series of exp(h A) applied to a vector, with the input linear over the step and w
+    held: exact to rounding as long as h times the norm of A is below 1. Parameters may enter A in any way: mixing
+    weights of a polytope do. The output integral uses the three Gauss nodes of a step (order 6).
+
+    Parameters
+    ----------
+    step : float
+        Largest step in seconds; longer slots are divided.
+
+    Raises
+    ------
+    InputError
+        For a model that is not linear, or depends on time; when an estimator is built.
+    """
+
+    step: float
+
+    nodes = np.array([0.5 - np.sqrt(0.15), 0.5, 0.5 + np.sqrt(0.15)])
+    weights = np.array([5.0, 8.0, 5.0]) / 18.0
+    accuracy = ROUND_OFF
+    order = 18
+
+    def __post_init__(self) -> None:
+        positive("Exact: step", self.step, "seconds")
+
+    def parts(self, interval: float) -> int:
+        """Return the number of equal steps, none longer than `step`, in a cell."""
+        return max(1, int(np.ceil(interval / self.step * (1 - 1e-9))))
+
+    def trace(self, model: Model, signal: bool) -> ca.Function:
+        """Return (t, h, x, w, p, u0, u1) -> (x_next, y): see `Integrator`."""
+        check_linear(model)
+        symbols = step_symbols(model, ca.SX)
+        t, h, x, w, p, u0, u1 = symbols
+        zero = ca.DM.zeros(len(model.x))
+        A = ca.jacobian(model.dynamics(0, x, u0, w, p), x)
+        start, end = (model.dynamics(0, zero, u, w, p) for u in (u0, u1))
+
+        def at(share: Any) -> Any:  # terms are derivatives of x at the step's start, times length^k / k!
+            length = share * h
+            term = length * (A @ x + start)
+            total = x + term
+            for k in range(2, self.order + 1):
+                term = length * (A @ term + (share * (end - start) if k == 2 else 0)) / k
+                total = total + term
+            return total
+
+        grid = [*self.nodes, 1.0] if signal else [1.0]
+        states = [at(share) for share in grid]
+        y = [model.output(t + c * h, z, u0 + c * (u1 - u0), w, p) for c, z in zip(grid, states, strict=True)]
+        return ca.Function("step", symbols, [states[-1], ca.horzcat(*y)])
+
+
+def is_linear(model: Model) -> bool:
+    """Return whether dynamics and output are affine in x, w and u together and do not depend on time."""
+    if not is_symbolic(model):
+        return False
+    sizes = [model.dynamics.size1_in(i) for i in range(5)]
+    t, x, u, w, p = (ca.SX.sym(name, size) for name, size in zip("txuwp", sizes, strict=True))
+    free = ca.vertcat(x, u, w)
+    for function in (model.dynamics, model.output):
+        value = function(t, x, u, w, p)
+        if ca.depends_on(value, t) or any(ca.which_depends(value, free, 2, False)):
+            return False
+    return True
+
+
+def check_linear(model: Model) -> None:
+    """Raise `InputError` unless the model is linear."""
+    if not is_linear(model):
+        raise InputError(
+            f"model {model.name!r} is not linear in its states, inputs and disturbances, or depends on time: use RK4 "
+            "or CVODES, and Extended or Unscented for a filter"
+        )
 
 
 @dataclass(frozen=True)

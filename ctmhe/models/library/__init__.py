@@ -4,6 +4,13 @@ from ctmhe.models.library.batch_reactor import batch_reactor
 from ctmhe.models.library.cascaded_tanks import cascaded_tanks
 from ctmhe.models.library.chua import chua, chua_discrete
 from ctmhe.models.library.cstr import cstr, cstr_discrete, cstr_steady_states
+from ctmhe.models.library.polytopes import (
+    drifting_sine,
+    sine_drift,
+    sine_polytope,
+    unknown_linear,
+    unknown_linear_matrices,
+)
 from ctmhe.models.library.quadrotor import hover_speed, quadrotor, quadrotor_discrete
 from ctmhe.models.library.random_stable import random_stable
 from ctmhe.models.library.refilled_reactor import refill, refilled_reactor
@@ -18,13 +25,18 @@ __all__ = [
     "cstr",
     "cstr_discrete",
     "cstr_steady_states",
+    "drifting_sine",
     "hover_speed",
     "quadrotor",
     "quadrotor_discrete",
     "random_stable",
     "refill",
     "refilled_reactor",
+    "sine_drift",
+    "sine_polytope",
     "three_species",
     "three_species_discrete",
+    "unknown_linear",
+    "unknown_linear_matrices",
     "van_der_pol",
 ]
