@@ -1,5 +1,6 @@
 """Estimators on explicit state."""
 
+from ctmhe.estimators.arrival import ArrivalUpdate
 from ctmhe.estimators.base import Estimator
 from ctmhe.estimators.filter import Filter
 from ctmhe.estimators.filter_state import FilterState
@@ -9,11 +10,13 @@ from ctmhe.estimators.mhe import MHE, Prediction
 from ctmhe.estimators.polytopic import AdaptiveArrival, dual_iterations, polytopic_horizon
 from ctmhe.estimators.robust_kalman import RobustKalman, norm_bounded
 from ctmhe.estimators.state import State
+from ctmhe.estimators.suboptimal import Suboptimal
 from ctmhe.estimators.unscented import Unscented
 
 __all__ = [
     "MHE",
     "AdaptiveArrival",
+    "ArrivalUpdate",
     "Estimator",
     "Extended",
     "Filter",
@@ -23,6 +26,7 @@ __all__ = [
     "Prediction",
     "RobustKalman",
     "State",
+    "Suboptimal",
     "Unscented",
     "dual_iterations",
     "norm_bounded",

@@ -2,7 +2,8 @@
 
 from ctmhe.models.continuous import ContinuousModel, Model
 from ctmhe.models.discrete import DiscreteModel
+from ctmhe.models.observer import observer_model
 from ctmhe.models.polytope import mixture, polytope
 from ctmhe.models.signals import Signals
 
-__all__ = ["ContinuousModel", "DiscreteModel", "Model", "Signals", "mixture", "polytope"]
+__all__ = ["ContinuousModel", "DiscreteModel", "Model", "Signals", "mixture", "observer_model", "polytope"]
