@@ -53,7 +53,11 @@ class Estimator(Protocol):
     model: Model
     horizon: float
     interval: float
-    hold: Mapping[str, str]
+
+    @property
+    def hold(self) -> Mapping[str, str]:
+        """How samples enter, by output."""
+        ...
 
     @property
     def p_estimated(self) -> bool:

@@ -70,11 +70,13 @@ class Told:
 class Prior(Protocol):
     """The prior of every window: a rule, without state of its own.
 
-    `reach` is for how many seconds before the horizon it needs measurements and inputs. One that also has a method
-    `told(mhe, state, solved) -> Told`, asked last, has a say in what the estimate says.
+    One that also has a method `told(mhe, state, solved) -> Told`, asked last, has a say in what the estimate says.
     """
 
-    reach: float
+    @property
+    def reach(self) -> float:
+        """For how many seconds before the horizon measurements and inputs are needed."""
+        ...
 
     def begin(self, mhe: MHE, state: State) -> Memory:
         """Return what is remembered at the start of estimation."""
