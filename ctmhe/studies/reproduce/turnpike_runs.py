@@ -75,7 +75,7 @@ def summary(runs: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, Any]
         row |= {number: cell([run[name][number] for run in runs]) for number in numbers}
         against = np.array([run[name]["SSE"] / run["turnpike"]["SSE"] for run in runs])
         row["SSE against turnpike prior, %"] = cell(100 * (against - 1))
-        row["regret per step"] = cell([run[name]["J"] - run["IHE"]["J"] for run in runs])
+        row["regret"] = cell([run[name]["J"] - run["IHE"]["J"] for run in runs])
         table.append(row)
     means = {name: float(np.mean([run[name]["SSE"] for run in runs])) for name in names}
     changes = {name: 100 * (means[name] / means["turnpike"] - 1) for name in names if name not in PRIORS}
