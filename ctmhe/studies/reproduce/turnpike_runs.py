@@ -67,7 +67,7 @@ def judged(mhe: MHE, experiment: Experiment, delays: Sequence[int]) -> dict[str,
 
 
 def summary(runs: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, Any]:
-    """Return a table of means, medians and spreads over runs, and the changes of SSE against standard MHE."""
+    """Return a table of means and spreads over runs, and the changes of SSE against standard MHE."""
     names, numbers = list(runs[0]), list(runs[0]["IHE"])
     table: list[dict[str, Any]] = []
     for name in names:
