@@ -101,21 +101,22 @@ class Regret:
 
 
 def regret(
-    mhe: MHE, log: MeasurementLog, t: Array, x: Array, benchmark: Array | OfflineEstimate, *, p: Any = None
+    mhe: MHE, log: MeasurementLog, t: Array, x: Array, benchmark: Array | OfflineEstimate | Benchmark, *, p: Any = None
 ) -> Regret:
     """Return the empirical regret of estimates against a benchmark at the same times (6.54), (6.60).
 
     Parameters
     ----------
-    benchmark : array (n, nx), or OfflineEstimate with states at `t`
+    benchmark : array (n, nx), or OfflineEstimate or Benchmark with states at `t`
         Such as the full problem's solution, or `infinite_horizon`'s.
 
     Other parameters and errors as for `rebuilt_disturbance`.
     """
     t = np.asarray(t, float)
-    other = benchmark.x if isinstance(benchmark, OfflineEstimate) else np.asarray(benchmark, float)
-    if isinstance(benchmark, OfflineEstimate):
+    if isinstance(benchmark, (OfflineEstimate, Benchmark)):
         other = _at_nodes(mhe, t, benchmark.t, benchmark.x)
+    else:
+        other = np.asarray(benchmark, float)
     own, best = performance(mhe, log, t, x, p=p), performance(mhe, log, t, other, p=p)
     return Regret(own, best, float(t[-1] - t[0]))
 

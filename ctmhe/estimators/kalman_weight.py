@@ -84,6 +84,8 @@ class KalmanWeight:
     def after(self, mhe: MHE, state: State, solved: Solved) -> Memory:
         """See `Prior`."""
         memory = prior_of(self.rule).after(mhe, state, solved)
+        if mhe.horizon == np.inf:  # a window without end keeps its first weight
+            return {**memory, COVARIANCES: state.memory[COVARIANCES]}
         log = state.memory[COVARIANCES].drop_after(state.since)
         times, rows = state.measurements.arrays(state.t + mhe.slack(state.t))
         last, row = (values[-1] for values in log.arrays())

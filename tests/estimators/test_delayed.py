@@ -12,6 +12,7 @@ from ctmhe import (
     RK4,
     DiscountedCost,
     InputError,
+    KalmanWeight,
     LinearGaps,
     Measurement,
     MeasurementLog,
@@ -21,6 +22,7 @@ from ctmhe import (
     Uniform,
     simulate,
 )
+from ctmhe.estimators.benchmark import infinite_horizon, regret
 from ctmhe.estimators.linear import rauch_tung_striebel
 from ctmhe.models.library import batch_reactor
 from ctmhe.studies.reproduce._offline import stepped
@@ -36,10 +38,10 @@ def reactor(delay: float | None = None, horizon: float = 2.0, **options) -> MHE:
     )  # fmt: skip
 
 
-def run(delay: float | None, trigger, seed: int = 0, until: float = 4.0):
+def run(delay: float | None, trigger, seed: int = 0, until: float = 4.0, **options):
     """Simulate the reactor under a trigger."""
     return simulate(
-        batch_reactor(), reactor(delay), trigger=trigger, until=until, truth=[3.0, 1.0], guess=[0.1, 4.5], monitor=0.02,
+        batch_reactor(), reactor(delay, **options), trigger=trigger, until=until, truth=[3.0, 1.0], guess=[0.1, 4.5], monitor=0.02,
         channel=SingleSample(), disturbance={"v_pressure": Uniform(0.05), "w_pA": Uniform(0.1)}, seed=seed,
     )  # fmt: skip
 
@@ -111,6 +113,19 @@ def test_a_run_tells_the_delayed_error():
     assert found.delayed_rms("pA", since=1.0) < found.delayed_rms(since=1.0) < 1.0
     assert "x_delayed.pA" in found.to_pandas()
     assert np.isnan(found.delayed_error().to_numpy()[-1]).all()
+
+
+def test_a_run_has_its_regret():
+    """A run's record gives benchmark and regret of its delayed trajectory: below that of what was known online."""
+    found = run(0.8, Periodic(0.1), until=5.0, prior=KalmanWeight("turnpike"))
+    cost = DiscountedCost(P=np.zeros((2, 2)), Q=3e3, R_point=1.2e3)
+    mhe, log = reactor(horizon=5.0).changed(cost=cost), found.to_log()
+    best = infinite_horizon(mhe, log, margin=1.0, guess=[2.8, 1.1])
+    assert len(best.t) == 31  # cell edges, at which the samples are
+    rows = np.searchsorted(found.t, best.t - 1e-9)
+    known = [found.dataset[name].to_numpy()[rows] for name in ("x_online", "x_delayed")]
+    online, delayed = (regret(mhe, log, best.t, x, best) for x in known)
+    assert 0.0 < delayed.total < online.total
 
 
 def test_a_delay_that_no_window_reaches_is_refused():
