@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ctmhe.data.log import MeasurementLog
-from ctmhe.errors import InputError
+from ctmhe.errors import InputError, MissingExtra
 from ctmhe.estimators.blocks import Block, blocks_of, in_parallel
 from ctmhe.estimators.guesses import shifted_guess
 from ctmhe.estimators.mhe import MHE
@@ -179,9 +179,7 @@ def estimate_offline(
         for part in blocks
     ]
     if content is not None:
-        import cloudpickle
-
-        tasks = [partial(_sent, cloudpickle.dumps(task)) for task in tasks]
+        tasks = _packed(tasks)
     return _joined(mhe, blocks, in_parallel(tasks, workers=workers, executor=executor), wanted, initial.p)
 
 
@@ -230,6 +228,15 @@ def _starting(guess: Any, block: Block, x: Array) -> Any:
 def _known(content: bytes) -> MHE:
     """Return the estimator that was sent: built once a process."""
     return pickle.loads(content)
+
+
+def _packed(tasks: list[Any]) -> list[Any]:
+    """Return tasks that other processes can read, whatever function the guess is."""
+    try:
+        from cloudpickle import dumps
+    except ImportError:
+        raise MissingExtra("cloudpickle", "study", "estimating on several workers") from None
+    return [partial(_sent, dumps(task)) for task in tasks]
 
 
 def _sent(content: bytes) -> Any:

@@ -41,8 +41,8 @@ def reactor(delay: float | None = None, horizon: float = 2.0, **options) -> MHE:
 def run(delay: float | None, trigger, seed: int = 0, until: float = 4.0, **options):
     """Simulate the reactor under a trigger."""
     return simulate(
-        batch_reactor(), reactor(delay, **options), trigger=trigger, until=until, truth=[3.0, 1.0], guess=[0.1, 4.5], monitor=0.02,
-        channel=SingleSample(), disturbance={"v_pressure": Uniform(0.05), "w_pA": Uniform(0.1)}, seed=seed,
+        batch_reactor(), reactor(delay, **options), trigger=trigger, until=until, truth=[3.0, 1.0], guess=[0.1, 4.5],
+        monitor=0.02, channel=SingleSample(), disturbance={"v_pressure": Uniform(0.05), "w_pA": Uniform(0.1)}, seed=seed,
     )  # fmt: skip
 
 
