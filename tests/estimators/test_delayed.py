@@ -42,7 +42,8 @@ def run(delay: float | None, trigger, seed: int = 0, until: float = 4.0, **optio
     """Simulate the reactor under a trigger."""
     return simulate(
         batch_reactor(), reactor(delay, **options), trigger=trigger, until=until, truth=[3.0, 1.0], guess=[0.1, 4.5],
-        monitor=0.02, channel=SingleSample(), disturbance={"v_pressure": Uniform(0.05), "w_pA": Uniform(0.1)}, seed=seed,
+        monitor=0.02, channel=SingleSample(), seed=seed,
+        disturbance={"v_pressure": Uniform(0.05), "w_pA": Uniform(0.1)},
     )  # fmt: skip
 
 
