@@ -152,3 +152,13 @@ def test_the_whole_horizon_is_the_longest_delay():
         if estimate.delayed is not None:
             np.testing.assert_allclose(estimate.delayed.x, estimate.trajectory.x[0], atol=1e-9)
     assert estimate.delayed.t == pytest.approx(2.0)
+
+
+def test_half_of_an_odd_horizon_is_whole_steps():
+    """The turnpike prior of a discrete model with 7 steps is a node of the solution made three steps later."""
+    log, _ = linear_record(25)
+    found = stepped(linear_mhe().changed(prior="turnpike", horizon=3.5), log, guess=np.ones(3))
+    for k in range(12, 26):
+        start, earlier = found[k].trajectory.t[0], found[k - 7 + 3].trajectory
+        node = int(np.argmin(np.abs(earlier.t - start)))
+        np.testing.assert_allclose(found[k].prior, earlier.x[node], atol=1e-9)
