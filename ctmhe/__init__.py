@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 from ctmhe.certificates.guarantee import Guarantee
 from ctmhe.data import MeasurementLog
 from ctmhe.errors import CtmheError, FmuError, InputError, MissingExtra, ModelError, NotEstimated, TooLate, TriggerError
-from ctmhe.estimators import MHE, Prediction, State
+from ctmhe.estimators import MHE, KalmanWeight, OfflineEstimate, Prediction, State, estimate_offline
 from ctmhe.models import ContinuousModel, DiscreteModel
 from ctmhe.models.fmu import FmuModel
 from ctmhe.simulation import (
@@ -101,6 +101,7 @@ __all__ = [
     "Input",
     "InputError",
     "Jittered",
+    "KalmanWeight",
     "LevelCrossing",
     "LinearGaps",
     "MaxInterval",
@@ -112,6 +113,7 @@ __all__ = [
     "Network",
     "NotEstimated",
     "OdePlant",
+    "OfflineEstimate",
     "Outcome",
     "Periodic",
     "Phases",
@@ -139,6 +141,7 @@ __all__ = [
     "WholeSignal",
     "certify_detectability",
     "check_fmu",
+    "estimate_offline",
     "explore",
     "find_threshold",
     "latin_hypercube",

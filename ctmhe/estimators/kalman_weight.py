@@ -60,8 +60,7 @@ class KalmanWeight:
         covariance = mhe.prior_covariance(state.t0)
         if not np.isfinite(covariance).all():
             raise InputError("KalmanWeight starts from the inverse of P, which must be positive definite")
-        nothing = np.zeros(len(mhe.model.u)) if not len(state.inputs) else None
-        if mhe.stage.nw and np.any(_output_jacobian(mhe, state, state.t0, state.x, nothing)[:, mhe.stage.nx :]):
+        if mhe.stage.nw and np.any(_output_jacobian(mhe, state, state.t0, state.x)[:, mhe.stage.nx :]):
             raise InputError("KalmanWeight: a disturbance enters the outputs; let the residual be the noise instead")
         row = np.concatenate([state.x, covariance.reshape(-1), covariance.reshape(-1)])
         before = float(np.nextafter(state.t0, -np.inf))  # what is measured at t0 is still to come
@@ -85,6 +84,8 @@ class KalmanWeight:
     def after(self, mhe: MHE, state: State, solved: Solved) -> Memory:
         """See `Prior`."""
         memory = prior_of(self.rule).after(mhe, state, solved)
+        if mhe.horizon == np.inf:  # a window without end keeps its first weight
+            return {**memory, COVARIANCES: state.memory[COVARIANCES]}
         log = state.memory[COVARIANCES].drop_after(state.since)
         times, rows = state.measurements.arrays(state.t + mhe.slack(state.t))
         last, row = (values[-1] for values in log.arrays())
@@ -109,12 +110,11 @@ def _split(mhe: MHE, row: Array) -> tuple[Array, Array, Array]:
     return row[:nx], before, after
 
 
-def _output_jacobian(mhe: MHE, state: State, t: float, x: Array, u: Array | None = None) -> Array:
+def _output_jacobian(mhe: MHE, state: State, t: float, x: Array) -> Array:
     """Return the Jacobian (ny, nx + nw) of the outputs at `t`."""
     stage = mhe.stage
-    if u is None:
-        rows = state.inputs.arrays(t + mhe.slack(t))[1]
-        u = rows[-1] if len(rows) else np.zeros(stage.nu)
+    rows = state.inputs.arrays(t + mhe.slack(t))[1]
+    u = rows[-1] if len(rows) else np.zeros(stage.nu)
     none, still = np.zeros((1, stage.nw)), np.zeros(1)
     linear = stage.linearize(np.array([t]), still, x[None], none, state.p, u[None], u[None])
     return linear.jacobian[0, -stage.ny :, : stage.nx + stage.nw]

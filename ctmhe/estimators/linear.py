@@ -73,15 +73,13 @@ class LinearProblem:
         b = np.zeros((steps, n)) if self.b is None else np.asarray(self.b, float)
         if b.shape != (steps, n):
             raise InputError(f"LinearProblem: the drive b has shape {b.shape}, expected {(steps, n)}: one row a step")
-        square = {
-            "Q": (self.Q, n),
-            "R": (self.R, ny),
-            "S": (self.R if self.S is None else self.S, ny),
-            "P": (self.P, n),
-        }
-        for name, (weight, size) in square.items():
-            object.__setattr__(self, name, frozen(_square(weight, size, name)))
-        if np.isnan(y).any() and not all(np.array_equal(M, np.diag(np.diag(M))) for M in (self.R, self.S)):
+        S = self.R if self.S is None else self.S
+        given = {"Q": (self.Q, n), "R": (self.R, ny), "S": (S, ny), "P": (self.P, n)}
+        weights = {name: frozen(_square(weight, size, name)) for name, (weight, size) in given.items()}
+        for name, weight in weights.items():
+            object.__setattr__(self, name, weight)
+        diagonal = all(np.array_equal(weights[name], np.diag(np.diag(weights[name]))) for name in "RS")
+        if np.isnan(y).any() and not diagonal:
             raise InputError("LinearProblem: y has gaps (NaN), so R and S must be diagonal; fill or drop those rows")
         mean = np.broadcast_to(np.asarray(self.mean, float), (n,))
         for name, value in (("A", A), ("C", C), ("y", y), ("b", b), ("mean", mean)):

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ctmhe.data.log import MeasurementLog
-from ctmhe.errors import InputError
+from ctmhe.errors import InputError, MissingExtra
 from ctmhe.estimators.blocks import Block, blocks_of, in_parallel
 from ctmhe.estimators.guesses import shifted_guess
 from ctmhe.estimators.mhe import MHE
@@ -179,9 +179,7 @@ def estimate_offline(
         for part in blocks
     ]
     if content is not None:
-        import cloudpickle
-
-        tasks = [partial(_sent, cloudpickle.dumps(task)) for task in tasks]
+        tasks = _packed(tasks)
     return _joined(mhe, blocks, in_parallel(tasks, workers=workers, executor=executor), wanted, initial.p)
 
 
@@ -201,7 +199,12 @@ def records_of(mhe: MHE, log: MeasurementLog) -> Records:
     for name in known:
         y[:, model.y.index(name)] = log.y[:, log.outputs.index(name)]
     u = log.u[:, [log.inputs.index(name) for name in model.u.names]]
-    return Records(log.t, y, log.t, u)
+    if not len(model.u):
+        return Records(log.t, y, log.t[:0], u[:0])
+    if mhe.assembly.input_linear:
+        return Records(log.t, y, log.t, u)
+    switched = np.concatenate([[True], (np.diff(u, axis=0) != 0).any(axis=1)])  # each row kept is a node of the mesh
+    return Records(log.t, y, log.t[switched], u[switched])
 
 
 def _seen(mhe: MHE, records: Records, block: Block) -> Records:
@@ -210,7 +213,8 @@ def _seen(mhe: MHE, records: Records, block: Block) -> Records:
     first = int(np.searchsorted(records.y_times, block.start - mhe.hold_limit - slack))
     first_u = max(int(np.searchsorted(records.u_times, block.start + slack, side="right")) - 1, 0)
     last = int(np.searchsorted(records.y_times, block.stop + slack, side="right"))
-    last_u = min(last + int(mhe.assembly.input_linear), len(records.u_times))
+    last_u = int(np.searchsorted(records.u_times, block.stop + slack, side="right"))
+    last_u = min(last_u + int(mhe.assembly.input_linear), len(records.u_times))
     return Records(records.y_times[first:last], records.y[first:last], records.u_times[first_u:last_u],
                    records.u[first_u:last_u])  # fmt: skip
 
@@ -224,6 +228,15 @@ def _starting(guess: Any, block: Block, x: Array) -> Any:
 def _known(content: bytes) -> MHE:
     """Return the estimator that was sent: built once a process."""
     return pickle.loads(content)
+
+
+def _packed(tasks: list[Any]) -> list[Any]:
+    """Return tasks that other processes can read, whatever function the guess is."""
+    try:
+        from cloudpickle import dumps
+    except ImportError:
+        raise MissingExtra("cloudpickle", "study", "estimating on several workers") from None
+    return [partial(_sent, dumps(task)) for task in tasks]
 
 
 def _sent(content: bytes) -> Any:

@@ -10,6 +10,7 @@ from uuid import uuid4
 
 import numpy as np
 
+from ctmhe.data.log import MeasurementLog
 from ctmhe.errors import InputError
 from ctmhe.types import Array, names_of
 
@@ -225,6 +226,18 @@ class Run:
             names = array[array.dims[1]].to_numpy()
             columns |= {f"{variable}.{name}": array.to_numpy()[:, i] for i, name in enumerate(names)}
         return pd.DataFrame(columns, index=pd.Index(self.t, name="time"))
+
+    def to_log(self) -> MeasurementLog:
+        """Return what was sampled, and the inputs, as a record: for `replay`, `estimate_offline` and `regret`.
+
+        A row at every monitoring time and every sample; outputs are missing (NaN) where none was taken.
+        """
+        times, data = np.union1d(self.t, self.sample_times), self.dataset
+        y = np.full((len(times), data.sizes["output"]), np.nan)
+        y[np.searchsorted(times, self.sample_times)] = data["y_sampled"].to_numpy()
+        held = np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, None)
+        names = [tuple(map(str, data[kind].to_numpy())) for kind in ("output", "input")]
+        return MeasurementLog(times, y, names[0], data["u"].to_numpy()[held], names[1])
 
     def events_to_pandas(self) -> pd.DataFrame:
         """Return a table over the samples: time, gap and outputs."""

@@ -12,6 +12,7 @@ from ctmhe import (
     RK4,
     DiscountedCost,
     InputError,
+    KalmanWeight,
     LinearGaps,
     Measurement,
     MeasurementLog,
@@ -21,6 +22,7 @@ from ctmhe import (
     Uniform,
     simulate,
 )
+from ctmhe.estimators.benchmark import infinite_horizon, regret
 from ctmhe.estimators.linear import rauch_tung_striebel
 from ctmhe.models.library import batch_reactor
 from ctmhe.studies.reproduce._offline import stepped
@@ -36,11 +38,12 @@ def reactor(delay: float | None = None, horizon: float = 2.0, **options) -> MHE:
     )  # fmt: skip
 
 
-def run(delay: float | None, trigger, seed: int = 0, until: float = 4.0):
+def run(delay: float | None, trigger, seed: int = 0, until: float = 4.0, **options):
     """Simulate the reactor under a trigger."""
     return simulate(
-        batch_reactor(), reactor(delay), trigger=trigger, until=until, truth=[3.0, 1.0], guess=[0.1, 4.5], monitor=0.02,
-        channel=SingleSample(), disturbance={"v_pressure": Uniform(0.05), "w_pA": Uniform(0.1)}, seed=seed,
+        batch_reactor(), reactor(delay, **options), trigger=trigger, until=until, truth=[3.0, 1.0], guess=[0.1, 4.5],
+        monitor=0.02, channel=SingleSample(), seed=seed,
+        disturbance={"v_pressure": Uniform(0.05), "w_pA": Uniform(0.1)},
     )  # fmt: skip
 
 
@@ -113,6 +116,19 @@ def test_a_run_tells_the_delayed_error():
     assert np.isnan(found.delayed_error().to_numpy()[-1]).all()
 
 
+def test_a_run_has_its_regret():
+    """A run's record gives benchmark and regret of its delayed trajectory: below that of what was known online."""
+    found = run(0.8, Periodic(0.1), until=5.0, prior=KalmanWeight("turnpike"))
+    cost = DiscountedCost(P=np.zeros((2, 2)), Q=3e3, R_point=1.2e3)
+    mhe, log = reactor(horizon=5.0).changed(cost=cost), found.to_log()
+    best = infinite_horizon(mhe, log, margin=1.0, guess=[2.8, 1.1])
+    assert len(best.t) == 31  # cell edges, at which the samples are
+    rows = np.searchsorted(found.t, best.t - 1e-9)
+    known = [found.dataset[name].to_numpy()[rows] for name in ("x_online", "x_delayed")]
+    online, delayed = (regret(mhe, log, best.t, x, best) for x in known)
+    assert 0.0 < delayed.total < online.total
+
+
 def test_a_delay_that_no_window_reaches_is_refused():
     """Longer than the horizon, negative, or between steps: named."""
     with pytest.raises(InputError, match="longer than the horizon"):
@@ -136,3 +152,13 @@ def test_the_whole_horizon_is_the_longest_delay():
         if estimate.delayed is not None:
             np.testing.assert_allclose(estimate.delayed.x, estimate.trajectory.x[0], atol=1e-9)
     assert estimate.delayed.t == pytest.approx(2.0)
+
+
+def test_half_of_an_odd_horizon_is_whole_steps():
+    """The turnpike prior of a discrete model with 7 steps is a node of the solution made three steps later."""
+    log, _ = linear_record(25)
+    found = stepped(linear_mhe().changed(prior="turnpike", horizon=3.5), log, guess=np.ones(3))
+    for k in range(12, 26):
+        start, earlier = found[k].trajectory.t[0], found[k - 7 + 3].trajectory
+        node = int(np.argmin(np.abs(earlier.t - start)))
+        np.testing.assert_allclose(found[k].prior, earlier.x[node], atol=1e-9)

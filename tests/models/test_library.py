@@ -19,9 +19,14 @@ from ctmhe.models.library import (
     cascaded_tanks,
     chua,
     cstr,
+    cstr_discrete,
     cstr_steady_states,
     hover_speed,
     quadrotor,
+    quadrotor_discrete,
+    random_stable,
+    refill,
+    refilled_reactor,
     three_species,
     three_species_discrete,
     van_der_pol,
@@ -601,3 +606,65 @@ def test_outflow_is_odd_smooth_and_never_infinite(z):
 def test_an_empty_tank_without_pump_rests():
     """Zero is an equilibrium, up to the softplus tail 0.05 exp(-200)."""
     np.testing.assert_allclose(evaluate(cascaded_tanks().dynamics, [0.0, 0.0], [0.0]), 0.0, atol=1e-80)
+
+
+# --- discrete-time plants of thesis 6.4 ----------------------------------------------------------------------
+
+
+@given(x=st.tuples(st.floats(0.0, 5.0), st.floats(0.0, 5.0)), w=st.tuples(*[st.floats(-0.05, 0.05)] * 2))
+def test_the_refilled_reactor_conserves_and_fills(x, w):
+    """(6.80): pA + 2 pB changes by inputs and disturbances only, pB by the rate; refilling gives (3, 0) exactly."""
+    model, u = refilled_reactor(step=0.1), np.array([0.3, -0.2])
+    after = evaluate(model.dynamics, x, u, w)
+    gained = np.array([1.0, 2.0]) @ (u + np.array(w))
+    np.testing.assert_allclose(after[0] + 2 * after[1], x[0] + 2 * x[1] + gained, atol=1e-12)
+    np.testing.assert_allclose(after[1] - x[1] - u[1] - w[1], 0.1 * (0.16 * x[0] ** 2 - 0.0064 * x[1]), atol=1e-12)
+    np.testing.assert_allclose(evaluate(model.dynamics, x, refill(np.array(x))), [3.0, 0.0], atol=1e-12)
+    assert evaluate(model.output, x, u)[0] == pytest.approx(x[0] + x[1])
+
+
+def test_the_discrete_stirred_tank_is_the_flow_over_a_step():
+    """One Runge-Kutta step of 15 s against a fine integration: off by the method's error only, w on top."""
+    flow, model, rng = cstr(noise=False).dynamics, cstr_discrete(), np.random.default_rng(0)
+    for _ in range(5):
+        x = np.array([0.88, 324.0, 0.66]) * rng.uniform(0.98, 1.02, 3)
+        u, w = np.array([rng.uniform(290, 305), rng.uniform(0.09, 0.11)]), rng.normal(size=3) * 1e-3
+        fine = solve_ivp(lambda _, z, u=u: evaluate(flow, z, u), (0, 15.0), x, rtol=1e-10, atol=1e-10).y[:, -1]
+        np.testing.assert_allclose(evaluate(model.dynamics, x, u, w), fine + w, rtol=2e-3)
+    coarse, half = cstr_discrete(step=4.0), cstr_discrete(step=2.0)
+    fine = solve_ivp(lambda _, z: evaluate(flow, z, u), (0, 4.0), x, rtol=1e-12, atol=1e-12).y[:, -1]
+    twice = evaluate(half.dynamics, evaluate(half.dynamics, x, u), u)
+    assert abs(twice[1] - fine[1]) < abs(evaluate(coarse.dynamics, x, u)[1] - fine[1]) / 12  # order 4: a sixteenth
+
+
+def test_the_discrete_quadrotor_is_an_euler_step_of_the_flow():
+    """x + 0.05 f(x, u) + w with f from forces on the rotors: the balance of momentum over a step."""
+    model, rng = quadrotor_discrete(), np.random.default_rng(1)
+    for z, xi, s, rates, u in flight_cases():
+        w = rng.normal(size=12) * 1e-2
+        x = np.concatenate([z, xi, s, rates])
+        thrust, _ = wrench(u)
+        R = attitude(xi)
+        force = M * G * E3 - thrust * R @ E3 - R @ (1.14 * np.cross(E3, rates))
+        after = evaluate(model.dynamics, x, u, w)
+        np.testing.assert_allclose(after[:3], z + 0.05 * s + w[:3], atol=1e-12)
+        np.testing.assert_allclose(after[6:9], s + 0.05 * force / M + w[6:9], rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(evaluate(model.output, x, u), x[:6])
+
+
+@given(states=st.integers(1, 24), seed=st.integers(0, 10**6))
+@settings(max_examples=30, deadline=None)
+def test_random_systems_are_stable_and_the_seed_decides(states, seed):
+    """All poles inside the unit circle, A normal (so that no state grows even in passing), the same for one seed."""
+    A, B, C = random_stable(states, 2, 3, seed=seed)
+    assert np.abs(np.linalg.eigvals(A)).max() < 1.0 and np.linalg.norm(A, 2) < 1.0
+    np.testing.assert_allclose(A @ A.T, A.T @ A, atol=1e-12)
+    assert (B.shape, C.shape) == ((states, 2), (3, states))
+    for one, other in zip((A, B, C), random_stable(states, 2, 3, seed=np.random.default_rng(seed)), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_sizes_of_random_systems_are_checked():
+    """Sizes are positive integers."""
+    with pytest.raises(InputError, match="random_stable: outputs"):
+        random_stable(3, 1, 0)

@@ -85,10 +85,16 @@ def reproduce(*, seeds: int = 100, steps: int = STEPS, workers: int = 1, progres
             "trapezoid_steps": list(EDGES),
             "x_bounds": [[0.5, 1.5], [200.0, 400.0], [0.5, 1.5]],
             "SSE": f"steps 0 to T_s - {max(DELAYS)}, of all estimators",
+            "J": "without the first quarter of the steps",
             "IHE": "the full problem over the record, without prior",
         },
         "comment": COMMENT,
     }
 
 
-COMMENT = ""
+COMMENT = (
+    "The trapezoid of the coolant's temperature is not printed; ours goes down and up between steps 60 and 140. "
+    "The published 20 per cent is read off a boxplot. The priors hardly differ; one step of delay takes most of "
+    "what half a horizon takes, which is close to the infinite-horizon estimate, as published. The regret is "
+    "large throughout: J weighs jumps of the level by 1e5, and pieces of different windows do not join smoothly."
+)

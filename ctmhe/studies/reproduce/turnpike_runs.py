@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from ctmhe.data.log import MeasurementLog
+from ctmhe.estimators.benchmark import performance
 from ctmhe.estimators.kalman_weight import KalmanWeight
 from ctmhe.estimators.mhe import MHE
 from ctmhe.estimators.offline import estimate_offline
-from ctmhe.estimators.performance import performance
 from ctmhe.studies.reproduce._offline import cell, squares, stepped
 from ctmhe.types import Array, Estimate
 
@@ -67,7 +67,7 @@ def judged(mhe: MHE, experiment: Experiment, delays: Sequence[int]) -> dict[str,
 
 
 def summary(runs: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, Any]:
-    """Return a table of means, medians and spreads over runs, and the changes of SSE against standard MHE."""
+    """Return a table of means and spreads over runs, and the changes of SSE against standard MHE."""
     names, numbers = list(runs[0]), list(runs[0]["IHE"])
     table: list[dict[str, Any]] = []
     for name in names:
@@ -75,7 +75,7 @@ def summary(runs: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, Any]
         row |= {number: cell([run[name][number] for run in runs]) for number in numbers}
         against = np.array([run[name]["SSE"] / run["turnpike"]["SSE"] for run in runs])
         row["SSE against turnpike prior, %"] = cell(100 * (against - 1))
-        row["regret per step"] = cell([run[name]["J"] - run["IHE"]["J"] for run in runs])
+        row["regret"] = cell([run[name]["J"] - run["IHE"]["J"] for run in runs])
         table.append(row)
     means = {name: float(np.mean([run[name]["SSE"] for run in runs])) for name in names}
     changes = {name: 100 * (means[name] / means["turnpike"] - 1) for name in names if name not in PRIORS}

@@ -101,21 +101,22 @@ class Regret:
 
 
 def regret(
-    mhe: MHE, log: MeasurementLog, t: Array, x: Array, benchmark: Array | OfflineEstimate, *, p: Any = None
+    mhe: MHE, log: MeasurementLog, t: Array, x: Array, benchmark: Array | OfflineEstimate | Benchmark, *, p: Any = None
 ) -> Regret:
     """Return the empirical regret of estimates against a benchmark at the same times (6.54), (6.60).
 
     Parameters
     ----------
-    benchmark : array (n, nx), or OfflineEstimate with states at `t`
+    benchmark : array (n, nx), or OfflineEstimate or Benchmark with states at `t`
         Such as the full problem's solution, or `infinite_horizon`'s.
 
     Other parameters and errors as for `rebuilt_disturbance`.
     """
     t = np.asarray(t, float)
-    other = benchmark.x if isinstance(benchmark, OfflineEstimate) else np.asarray(benchmark, float)
-    if isinstance(benchmark, OfflineEstimate):
+    if isinstance(benchmark, (OfflineEstimate, Benchmark)):
         other = _at_nodes(mhe, t, benchmark.t, benchmark.x)
+    else:
+        other = np.asarray(benchmark, float)
     own, best = performance(mhe, log, t, x, p=p), performance(mhe, log, t, other, p=p)
     return Regret(own, best, float(t[-1] - t[0]))
 
@@ -235,24 +236,24 @@ def _disturbance(mhe: MHE, window: Window, nodes: Array) -> Array:
     stage, mesh = mhe.stage, window.mesh
     n, nx, nw = len(mesh), stage.nx, stage.nw
     w, p = np.zeros((n, nw)), window.prior[nx:]
-    live = mesh.h > 0
+    live = np.flatnonzero(mesh.h > 0)
     scale = mhe.model.x.nominal
+    free = np.linalg.pinv(window.L_w[live])  # |w|_Q = |L_w w|
     for _ in range(NEWTON_STEPS):
         linear = stage.linearize(mesh.t[:-1], mesh.h, nodes[:-1], w, p, window.u0, window.u1)
-        gap = np.where(live[:, None], nodes[1:] - linear.x_next, 0.0)
-        if np.max(np.abs(gap) / scale) <= 1e-12:
+        gap = (nodes[1:] - linear.x_next)[live] / scale
+        if np.max(np.abs(gap), initial=0.0) <= 1e-12:
             break
-        B = linear.jacobian[:, :nx, nx : nx + nw] / scale[:, None]
-        for k in np.flatnonzero(live):
-            root = window.L_w[k]  # |w|_Q = |root w|
-            free = np.linalg.pinv(root)
-            reach = B[k] @ free
-            if np.linalg.matrix_rank(reach) < nx:
-                raise InputError(
-                    "(6.52) needs a disturbance that takes any state to any other in one step (6.49): the states "
-                    f"{', '.join(mhe.model.x.names)} have {nx} dimensions, the disturbances "
-                    f"{', '.join(mhe.model.w.names) or 'none'} reach {np.linalg.matrix_rank(reach)} of them"
-                )
-            # least norm of the whole w, not of the correction: the step lands on B (w + step) = B w + gap
-            w[k] = free @ np.linalg.pinv(reach) @ (B[k] @ w[k] + gap[k] / scale)
+        B = linear.jacobian[live, :nx, nx : nx + nw] / scale[:, None]
+        reach = B @ free
+        rank = np.linalg.matrix_rank(reach).min() if nw else 0
+        if rank < nx:
+            raise InputError(
+                "(6.52) needs a disturbance that takes any state to any other in one step (6.49): the states "
+                f"{', '.join(mhe.model.x.names)} have {nx} dimensions, the disturbances "
+                f"{', '.join(mhe.model.w.names) or 'none'} reach {rank} of them"
+            )
+        # least norm of the whole w, not of the correction: the step lands on B (w + step) = B w + gap
+        target = B @ w[live][..., None] + gap[..., None]
+        w[live] = (free @ np.linalg.pinv(reach) @ target)[..., 0]
     return w
