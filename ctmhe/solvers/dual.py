@@ -139,7 +139,8 @@ class _Turns:
     ) -> tuple[tuple[Guess, Array], Array, Array, tuple[Array, Array]]:
         """Return the trajectory of some weights through the states at the edges of cells, residuals and Jacobian.
 
-        Last come the derivatives of w and y by the weights. The disturbance of a cell is what leads to the next edge: the model is linear in it. `cells` (N,) numbers them.
+        Last come the derivatives of w and y by the weights. The disturbance of a cell is what leads to its end: the
+        model is linear in it. `cells` (N,) numbers them.
         """
         stage, mesh, n = self.stage, window.mesh, len(window.mesh)
         nx, nw, q = stage.nx, stage.nw, stage.np
