@@ -183,7 +183,7 @@ def reproduce(
 
 COMMENT = (
     "The thesis prints eta = 0.87 and N = 30; matrices, manoeuvre and initial estimate are not printed, and its "
-    "figures show no numbers. Ours has its own certificate, flight and guesses. |e|_P is the error in the certificate's norm, "
+    "figures show no numbers. Ours has its own certificate, flight and guesses. |e|_P is the error in its norm, "
     "as in Fig. 3.5; `error over its bound` compares it with what Estimate.bound says without knowing the truth, and "
     "stays below one. The EKF, with the variances of the noise, is the statistically tuned rival: it converges here, "
     "has smaller errors where weights of a guarantee are not those of the noise, and guarantees nothing."
