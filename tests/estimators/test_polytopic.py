@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -83,7 +85,7 @@ def test_every_dual_iteration_lowers_the_joint_cost(seed):
         assert estimate.p.min() >= 0 and estimate.p.sum() == pytest.approx(1.0)
         path, A = estimate.trajectory, mixture(VERTICES, estimate.p / estimate.p.sum())
         np.testing.assert_allclose(path.x[1:-1], path.x[:-2] @ A.T + path.w[:-1], atol=1e-9)
-    assert all(late <= early * (1 + 1e-9) for early, late in zip(costs, costs[1:], strict=False))
+    assert all(late <= early * (1 + 1e-9) for early, late in pairwise(costs))
     assert costs[-1] < costs[0]
 
 
@@ -142,7 +144,7 @@ def continuous(**changes):
 
 
 def test_continuous_time_polytopes_take_irregular_samples(rng):
-    """Samples within cells, exact over every gap: the weights of an oscillator between two are found; saved, continued."""
+    """Samples within cells, exact over every gap: the weights of an oscillator between two are found."""
     model, mhe = continuous()
     truth = ContinuousModel(
         lambda t, x, u, w, p: (x[1], -5.0 * x[0] - 0.3 * x[1]), lambda t, x, u, w, p: x[0], x=["a", "b"], y=["y"]
@@ -161,7 +163,7 @@ def test_continuous_time_polytopes_take_irregular_samples(rng):
 
 
 def test_polytopes_run_under_triggers_and_continue_from_files(tmp_path):
-    """Simulated with send-on-delta in steps; a state saved half-way, with the adaptive prior's memory, goes on alike."""
+    """Simulated with send-on-delta; a state saved half-way, with the adaptive prior's memory, goes on alike."""
     mhe = polytopic(prior=AdaptiveArrival(1e-2, 5.0))
     A = mixture(VERTICES, TRUE)
     plant = DiscreteModel(
@@ -179,7 +181,8 @@ def test_polytopes_run_under_triggers_and_continue_from_files(tmp_path):
         state, _ = mhe.estimate(mhe.observe(state, Measurement(float(k), y[k])), float(k))
     mhe.save(state, tmp_path / "state.npz")
     ends = []
-    for branch in (state, mhe.load(tmp_path / "state.npz"), state):
+    for start in (state, mhe.load(tmp_path / "state.npz"), state):
+        branch = start
         for k in range(10, 16):
             branch, estimate = mhe.estimate(mhe.observe(branch, Measurement(float(k), y[k])), float(k))
         ends.append(np.concatenate([estimate.x, estimate.p, [estimate.cost]]))
@@ -216,8 +219,8 @@ def test_the_arrival_cost_is_recursive_least_squares(seed, size, sigma):
 
 
 def test_bad_weights_and_polytopes_are_named_and_the_estimate_is_usable(rng):
-    """Off the simplex: projected, with a note. Data that no mixture explains: a note, finite estimate on the simplex."""
-    x, y = data(rng, 8)
+    """Off the simplex: projected, with a note. Data that no mixture explains: a note, and an estimate."""
+    _, y = data(rng, 8)
     mhe = polytopic()
     state = feed(mhe, mhe.init(x=[0.0, 0.0], p=[0.9, 0.9, 0.1]), np.arange(8.0), y)
     _, estimate = mhe.estimate(state, 5.0)
@@ -239,7 +242,7 @@ def test_wrong_vertices_starts_and_settings_are_named():
         polytope([VERTICES[0], np.eye(3)], C)
     with pytest.raises(InputError, match="2 vertices A but 3 of C"):
         polytope(VERTICES[:2], [C, C, C])
-    with pytest.raises(InputError, match="sum 1.2"):
+    with pytest.raises(InputError, match=r"sum 1\.2"):
         polytope(VERTICES, C, start=[0.4, 0.4, 0.4])
     with pytest.raises(InputError, match=">= 0"):
         mixture(VERTICES, [1.5, -0.5, 0.0])
