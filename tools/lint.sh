@@ -15,6 +15,7 @@ check "ruff" .venv/bin/ruff check .
 check "pyright" .venv/bin/pyright --pythonpath .venv/bin/python
 check "import order" .venv/bin/lint-imports
 check "notebook pairs" .venv/bin/python tools/check_notebooks.py
+check "published results" .venv/bin/python tools/published.py --check
 check "shell scripts" bash -n tools/*.sh .ci/run
 
 if [ ${#failed[@]} -gt 0 ]; then

@@ -137,27 +137,46 @@ def fmu_build(
 
 @app.command()
 def reproduce(
-    case: Annotated[str, typer.Argument(help="Name of a published result, such as thesis-3.4.1-ct; `list` shows all.")],
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the result as JSON.")] = None,
+    case: Annotated[
+        str,
+        typer.Argument(
+            help="Name of a result, such as thesis-3.4.1-ct; `list` shows them, `all` runs those of the papers."
+        ),
+    ],
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write the result as JSON; with `all`, a folder with a file a case.")
+    ] = None,
     seeds: Annotated[int | None, typer.Option(help="Seeded runs; the case's own number if left out.", min=1)] = None,
-    workers: Annotated[int, typer.Option(help="Processes.", min=1)] = 1,
+    workers: Annotated[int, typer.Option(help="Processes for the runs of one case.", min=1)] = 1,
+    jobs: Annotated[int, typer.Option(help="Cases at a time, with `all`.", min=1)] = 1,
 ) -> None:
     """Reproduce a published result and print it beside the published numbers."""
-    from ctmhe.studies.reproduce import CASES
+    from ctmhe.studies.reproduce import CASES, PAPERS
     from ctmhe.studies.reproduce import reproduce as run_case
+    from ctmhe.studies.reproduce.together import together, write
 
     if case == "list":
         typer.echo("\n".join(CASES))
         return
     given = {} if seeds is None else {"seeds": seeds}
+    if case == "all":
+        failed = 0
+        for number, done in enumerate(together(PAPERS, jobs=jobs, folder=json_file, options=given), start=1):
+            said = f"{done.seconds:7.1f} s" if done.result is not None else f"failed: {done.error}"
+            typer.echo(f"{number:3d}/{len(PAPERS)}  {done.name:<32s} {said}")
+            failed += done.result is None
+        if json_file is not None:
+            typer.echo(f"written: {json_file}")
+        if failed:
+            raise typer.Exit(1)
+        return
     result = run_case(case, **given, workers=workers, progress=sys.stderr.isatty())
     for part in ("published", "ours"):
         typer.echo(f"{part}:")
         typer.echo(textwrap.indent(json.dumps(result[part], indent=2), "  "))
     typer.echo(textwrap.fill(result["comment"], 100))
     if json_file is not None:
-        json_file.parent.mkdir(parents=True, exist_ok=True)
-        json_file.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+        write(result, json_file)
         typer.echo(f"written: {json_file}")
 
 

@@ -14,6 +14,7 @@ from ctmhe.errors import InputError
 from ctmhe.simulation import Run
 from ctmhe.studies.reproduce import reproduce, study_reactor_budget, study_solves_saved
 from ctmhe.studies.reproduce.reactor import CHANNELS, FAMILIES
+from ctmhe.studies.reproduce.together import together, write
 from fmus.build import build
 
 CONFIG = """
@@ -214,3 +215,21 @@ def test_a_co_simulation_fmu_is_estimated_as_a_step_map(files):
     assert result.exit_code == 0, result.output + repr(result.exception)
     run = Run.load(folder / "out" / "run.nc")
     np.testing.assert_allclose(run.dataset["x_online"].values[-1], x[:, -1], atol=0.15)
+
+
+def test_cases_together_write_a_file_each_and_one_that_fails_stops_no_other(tmp_path):
+    """Two good names and a bad one, two at a time: two files, equal to what each case gives alone, and one reason."""
+    names = ("thesis-table-4.2", "thesis-9", "thesis-5.2.4-horizon")
+    done = {one.name: one for one in together(names, jobs=2, folder=tmp_path)}
+    assert set(done) == set(names)
+    assert done["thesis-9"].result is None and "unknown case" in done["thesis-9"].error
+    assert {path.stem for path in tmp_path.iterdir()} == {"thesis-table-4.2", "thesis-5.2.4-horizon"}
+    kept = json.loads((tmp_path / "thesis-table-4.2.json").read_text())
+    assert kept["ours"]["horizons"] == reproduce("thesis-table-4.2")["ours"]["horizons"]
+
+
+def test_results_are_written_with_six_digits(tmp_path):
+    """Round-off of another machine does not change a file; whole numbers, texts and NaN-free lists stay."""
+    write({"ours": {"a": [1 / 3, 2], "b": "text", "c": (True, None)}, "x": 123456789.0}, tmp_path / "deep" / "r.json")
+    kept = json.loads((tmp_path / "deep" / "r.json").read_text())
+    assert kept == {"ours": {"a": [0.333333, 2], "b": "text", "c": [True, None]}, "x": 123457000.0}

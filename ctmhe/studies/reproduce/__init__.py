@@ -42,6 +42,9 @@ CASES: dict[str, Callable[..., dict[str, Any]]] = {
     "study-solves-saved": study_solves_saved.reproduce,
 }
 
+PAPERS = tuple(name for name in CASES if name.startswith(("thesis", "paper")))
+"""What papers print; the other cases are questions of our own."""
+
 
 def reproduce(case: str, **options: Any) -> dict[str, Any]:
     """Run a case by name; keywords such as `seeds=` go to it.
