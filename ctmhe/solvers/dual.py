@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
-from scipy.optimize import nnls
 
 from ctmhe.errors import InputError
 from ctmhe.solvers.base import Solution, Solver
@@ -192,6 +191,8 @@ def simplex_least_squares(J: Array, b: Array) -> Array:
     On the simplex J a - b = D a with D = J - b 1'. The minimiser of |D a|^2 + (1'a - 1)^2 over a >= 0 is a multiple of
     the one sought, whatever the size of D: along a ray the best multiple costs f / (1 + f), which grows with f.
     """
+    from scipy.optimize import nnls  # of SciPy only what is needed, when it is
+
     D = J - b[:, None]
     D = D / max(float(np.linalg.norm(D)), 1e-300)
     a, _ = nnls(np.vstack([D, np.ones(D.shape[1])]), np.append(np.zeros(len(D)), 1.0))
