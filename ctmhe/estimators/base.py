@@ -50,10 +50,25 @@ class Estimator(Protocol):
         An input that becomes known changes what was predicted before it.
     """
 
-    model: Model
-    horizon: float
-    interval: float
-    hold: Mapping[str, str]
+    @property
+    def model(self) -> Model:
+        """The model."""
+        ...
+
+    @property
+    def horizon(self) -> float:
+        """Seconds of data that an estimate uses."""
+        ...
+
+    @property
+    def interval(self) -> float:
+        """Seconds from one edge to the next."""
+        ...
+
+    @property
+    def hold(self) -> Mapping[str, str]:
+        """How samples enter."""
+        ...
 
     @property
     def p_estimated(self) -> bool:

@@ -130,8 +130,8 @@ class _Turns:
                     continue
             w, total = trial[0].w, cost_of(window, *trial)
             if total <= before and ((w >= window.w_lower - slack) & (w <= window.w_upper + slack)).all():
-                return *trial, total
-        return *found, before
+                return trial[0], trial[1], total
+        return found[0], found[1], before
 
     def _followed(
         self, window: Window, point: Guess, cells: np.ndarray, alpha: Array

@@ -86,10 +86,10 @@ def minmax(G: Array, y: Array, prior: Array, weight: float, mean: float) -> Arra
 
     level, slope = stages(x)
     s = float(level.max()) * 1.5 + 1e-6
-    multipliers = np.full(n + 1, 1.0 / (n + 1))
-    for _ in range(60):
+    multipliers, centre = np.full(n + 1, 1.0 / (n + 1)), 0.1
+    for _ in range(80):
         gap = s - level
-        mu = 0.1 * float(multipliers @ gap) / (n + 1)
+        mu = centre * float(multipliers @ gap) / (n + 1)
         ratio = multipliers / gap
         gradient = _gathered((mean + mu / gap)[:, None] * slope, n, nx)
         gradient[:nx] += 2 * weight * (x[0] - prior)
@@ -100,7 +100,10 @@ def minmax(G: Array, y: Array, prior: Array, weight: float, mean: float) -> Arra
         band[0] += 1e-12 * float(band[0].max()) + 1e-12
         band[0, -nx:] += 1.0  # the state behind the last
         border = -_gathered(ratio[:, None] * slope, n, nx)
-        both = solveh_banded(band, np.column_stack([-gradient, border]), lower=True)
+        try:
+            both = solveh_banded(band, np.column_stack([-gradient, border]), lower=True)
+        except np.linalg.LinAlgError:  # as exact as rounding allows
+            break
         bend = float(ratio.sum() - border @ both[:, 1])
         ds = (-(1 - float(np.sum(mu / gap))) - float(border @ both[:, 0])) / max(bend, 1e-300)
         dx = both[:, 0] - both[:, 1] * ds
@@ -109,12 +112,13 @@ def minmax(G: Array, y: Array, prior: Array, weight: float, mean: float) -> Arra
         dm = mu / gap - multipliers - ratio * (ds - along)
         share = min(1.0, 0.99 / max(float((-dm / multipliers).max()), 1e-300))
         step = 1.0
-        while step > 1e-10:
-            level, slope = stages(x + step * move)
-            if (s + step * ds - level > 0.005 * gap).all():
-                break
+        while (s + step * ds - stages(x + step * move)[0] <= 0.005 * gap).any() and step > 1e-10:
             step *= 0.7
+        if step <= 1e-10:
+            break
         x, s, multipliers = x + step * move, s + step * ds, multipliers + share * dm
+        level, slope = stages(x)
+        centre = 0.1 if min(step, share) > 0.3 else 0.5
         if float(multipliers @ (s - level)) < 1e-6 * max(s, 1e-9) and step > 0.9:
             break
     return x[:-1]

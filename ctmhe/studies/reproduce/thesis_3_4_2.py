@@ -72,7 +72,9 @@ def estimators(certified: bool) -> dict[str, Estimator]:
     options: dict[str, Any] = {"horizon": HORIZON * STEP, "bounds": model.bounds}
     if certified:
         own = certificate()
-        mhe = MHE(model, cost=DiscountedCost.from_certificate(own), guarantee=Guarantee(own, sizes), **options)
+        mhe = MHE(
+            model, cost=DiscountedCost.from_certificate(own), guarantee=Guarantee(own, sizes, error=SPREAD), **options
+        )
     else:
         mhe = MHE(model, cost=statistical, **options)
     return {"MHE": mhe, "EKF": Filter(model, Extended(), cost=statistical)}
@@ -141,7 +143,7 @@ def reproduce(
     dict with `published`, `ours` (`table`: a row an estimator), `settings`, `comment`
     """
     runs = over_seeds(one_seed, seeds, workers, progress=progress, steps=steps, certified=certified)
-    table = [
+    table: list[dict[str, Any]] = [
         {"estimator": name}
         | {
             key: {"mean": float(np.mean(v := [run[name][key] for run in runs])), "std": float(np.std(v))}
