@@ -10,7 +10,7 @@ import numpy as np
 from ctmhe.errors import InputError
 from ctmhe.solvers.base import Solution, Solver
 from ctmhe.transcription.integrators import is_symbolic
-from ctmhe.transcription.problem import Guess, Window, cost_of
+from ctmhe.transcription.problem import Guess, Window, bound_violation, cost_of
 from ctmhe.transcription.stage import StageFunction
 from ctmhe.transcription.weights import square_root
 from ctmhe.types import Array, Outcome, positive
@@ -113,9 +113,10 @@ class _Turns:
 
     def _weights(self, window: Window, cells: np.ndarray, solution: Solution) -> tuple[Guess, Array, float]:
         """Solve (11): weights for given states at the edges of cells. Return point, outputs and cost, never larger."""
-        point, slack = solution.point, 1e-12 * window.w_scale
+        point = solution.point
         found, r, J, by_alpha = self._followed(window, point, cells, point.p)
         before = cost_of(window, *found)
+        allowed = max(1e-9, bound_violation(window, found[0], found[1][:, -1]))
         move = simplex_least_squares(J, J @ point.p - r) - point.p
         for share in 0.5 ** np.arange(30):  # where the model is affine in the weights the whole move is best
             step = share * move
@@ -128,8 +129,8 @@ class _Turns:
                     trial = self._followed(window, point, cells, point.p + step)[0]
                 except FloatingPointError:
                     continue
-            w, total = trial[0].w, cost_of(window, *trial)
-            if total <= before and ((w >= window.w_lower - slack) & (w <= window.w_upper + slack)).all():
+            total = cost_of(window, *trial)
+            if total <= before and bound_violation(window, trial[0], trial[1][:, -1]) <= allowed:
                 return trial[0], trial[1], total
         return found[0], found[1], before
 

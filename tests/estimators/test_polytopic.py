@@ -234,6 +234,20 @@ def test_bad_weights_and_polytopes_are_named_and_the_estimate_is_usable(rng):
     assert "no mixture" not in str(fine.status)
 
 
+def test_bounds_hold_in_both_turns(rng):
+    """Disturbances and residuals in boxes that bind: kept; in boxes that no mixture meets: a prediction, said so."""
+    _, y = data(rng, 8, w=0.3)
+    loose = polytopic(horizon=20.0)
+    _, free = loose.estimate(feed(loose, loose.init(x=[1.0, 0.0]), np.arange(8.0), y), 7.0)
+    box = 0.7 * float(np.abs(free.trajectory.w).max())
+    tight = polytopic(horizon=20.0, bounds=Bounds(p=(0.0, 1.0), w=(-box, box)))
+    _, estimate = tight.estimate(feed(tight, tight.init(x=[1.0, 0.0]), np.arange(8.0), y), 7.0)
+    assert np.abs(estimate.trajectory.w).max() <= box * (1 + 1e-6) and estimate.cost >= free.cost * (1 - 1e-6)
+    never = polytopic(horizon=20.0, bounds=Bounds(p=(0.0, 1.0), w=(-1e-4, 1e-4), residual=(-1e-4, 1e-4)))
+    _, estimate = never.estimate(feed(never, never.init(x=[1.0, 0.0]), np.arange(8.0), y), 7.0)
+    assert estimate.status.outcome is Outcome.PREDICTED and np.isfinite(estimate.x).all()
+
+
 def test_wrong_vertices_starts_and_settings_are_named():
     """Every error says what was given and what is needed."""
     with pytest.raises(InputError, match="no vertices"):
