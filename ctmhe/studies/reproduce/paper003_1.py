@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import casadi as ca
@@ -40,6 +41,7 @@ def linear(A: Array, C: Array) -> DiscreteModel:
     )
 
 
+@cache
 def polytopic(iterations: int = ITERATIONS, horizon: int = HORIZON) -> MHE:
     """Return the adaptive polytopic estimator with the printed weights."""
     return MHE(
@@ -74,16 +76,24 @@ def simulated(seed: int, steps: int, sw: float = SW, sv: float = SV) -> tuple[Ar
     return x, y
 
 
+@cache
+def filters() -> dict[str, Filter]:
+    """Return the Kalman filter of the system, and the robust one of the nominal model and the polytope."""
+    cost, model = DiscountedCost(P=P_INVERSE, Q=1 / SW**2, R=1 / SV**2), unknown_linear_matrices(MODEL)
+    uncertain = norm_bounded(list(zip(UNKNOWN_A, UNKNOWN_C, strict=True)), model)
+    return {
+        "KF_R": Filter(linear(*model), RobustKalman(*uncertain), cost=cost),
+        "KF": Filter(linear(*unknown_linear_matrices(SYSTEM)), Kalman(), cost=cost),
+    }
+
+
 def one_trial(seed: int, steps: int = STEPS) -> dict[str, Array]:
     """Return the mean square error (2,) of every estimator in one run."""
     system, model = unknown_linear_matrices(SYSTEM), unknown_linear_matrices(MODEL)
     x, y = simulated(seed, steps)
-    cost = DiscountedCost(P=P_INVERSE, Q=1 / SW**2, R=1 / SV**2)
-    uncertain = norm_bounded(list(zip(UNKNOWN_A, UNKNOWN_C, strict=True)), model)
     stage: dict[str, Any] = {"q": np.full(2, Q_INVERSE), "r": np.array([R_INVERSE]), "L": P_INVERSE}
     found = {
-        "KF_R": track(Filter(linear(*model), RobustKalman(*uncertain), cost=cost), y, GUESS)[0],
-        "KF": track(Filter(linear(*system), Kalman(), cost=cost), y, GUESS)[0],
+        **{name: track(one, y, GUESS)[0] for name, one in filters().items()},
         "FIE": MinMaxEstimator(lambda k, x: system, np.inf, **stage).track(y, GUESS),
         "MHE_R": MinMaxEstimator(lambda k, x: model, HORIZON, **stage).track(y, GUESS),
         "MHE_A": track(polytopic(), y, GUESS)[0],
@@ -132,7 +142,7 @@ def reproduce(
     workers: int = 1,
     progress: bool = False,
     steps: int = STEPS,
-    sweep: int = 10,
+    sweep: int = 5,
     iterations: tuple[int, ...] = (1, 2, 5, 10, 20),
     horizons: tuple[int, ...] = (4, 8, 12),
 ) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
 import casadi as ca
@@ -28,6 +29,7 @@ PUBLISHED_TABLE = [
 ]
 
 
+@cache
 def polytopic(iterations: int = ITERATIONS, horizon: int = HORIZON) -> MHE:
     """Return the adaptive polytopic estimator with the printed weights."""
     return MHE(
@@ -64,9 +66,25 @@ def simulated(seed: int, p1: Array, sw: float = SW, sv: float = SV) -> tuple[Arr
     return x, y
 
 
+@cache
+def filters() -> dict[str, Filter]:
+    """Return the robust Kalman filter of the nominal model and the polytope, and the extended one of the system."""
+    cost = DiscountedCost(P=P_INVERSE, Q=1 / SW**2, R=1 / SV**2)
+    uncertain = norm_bounded([(A, SINE_C) for A in SINE_A], nominal())
+    return {
+        "EKF_R": Filter(linear(*nominal()), RobustKalman(*uncertain), cost=cost),
+        "EKF": Filter(known_drift(), Extended(), cost=cost),
+    }
+
+
+def nominal() -> tuple[Array, Array]:
+    """Return the model at the polytope's middle."""
+    return mixture(SINE_A, np.full(3, 1 / 3)), np.array(SINE_C)
+
+
 def extended(y: Array, p1: Array) -> Array:
     """Return the estimates (steps, 2) of the extended Kalman filter that knows the system and p1."""
-    one = Filter(known_drift(), Extended(), cost=DiscountedCost(P=P_INVERSE, Q=1 / SW**2, R=1 / SV**2))
+    one = filters()["EKF"]
     state, found = one.init(x=GUESS), []
     for k, row in enumerate(y):
         state = one.observe(one.control(state, Input(float(k), p1[k : k + 1])), Measurement(float(k), row))
@@ -77,9 +95,6 @@ def extended(y: Array, p1: Array) -> Array:
 
 def one_trial(seed: int, steps: int = STEPS) -> dict[str, dict[str, Array]]:
     """Return the mean square error (2,) of every estimator in one run, by variant of the drift."""
-    nominal = mixture(SINE_A, np.full(3, 1 / 3)), np.array(SINE_C)
-    cost = DiscountedCost(P=P_INVERSE, Q=1 / SW**2, R=1 / SV**2)
-    uncertain = norm_bounded([(A, SINE_C) for A in SINE_A], nominal)
     stage: dict[str, Any] = {"q": np.array(Q_INVERSE), "r": np.array([R_INVERSE]), "L": P_INVERSE}
     result = {}
     for name, drift in VARIANTS.items():
@@ -90,9 +105,9 @@ def one_trial(seed: int, steps: int = STEPS) -> dict[str, dict[str, Array]]:
             return np.array([[0.0, 1.0], [p1[k], P2 * np.cos(P2 * x_hat[1])]]), np.array(SINE_C)
 
         found = {
-            "EKF_R": track(Filter(linear(*nominal), RobustKalman(*uncertain), cost=cost), y, GUESS)[0],
+            "EKF_R": track(filters()["EKF_R"], y, GUESS)[0],
             "FIE": MinMaxEstimator(linearised, np.inf, **stage).track(y, GUESS),
-            "MHE_R": MinMaxEstimator(lambda k, x: nominal, HORIZON, **stage).track(y, GUESS),
+            "MHE_R": MinMaxEstimator(lambda k, x: nominal(), HORIZON, **stage).track(y, GUESS),
             "MHE_A": track(polytopic(), y, GUESS)[0],
             "EKF, true model": extended(y, p1),
         }
@@ -118,7 +133,7 @@ def reproduce(
     workers: int = 1,
     progress: bool = False,
     steps: int = STEPS,
-    sweep: int = 10,
+    sweep: int = 5,
     iterations: tuple[int, ...] = (1, 2, 5, 15),
     horizons: tuple[int, ...] = (4, 8, 12),
 ) -> dict[str, Any]:
