@@ -6,8 +6,25 @@ from typing import TYPE_CHECKING, Any
 from ctmhe.certificates.guarantee import Guarantee
 from ctmhe.data import MeasurementLog
 from ctmhe.errors import CtmheError, FmuError, InputError, MissingExtra, ModelError, NotEstimated, TooLate, TriggerError
-from ctmhe.estimators import MHE, KalmanWeight, OfflineEstimate, Prediction, State, estimate_offline
-from ctmhe.models import ContinuousModel, DiscreteModel
+from ctmhe.estimators import (
+    MHE,
+    AdaptiveArrival,
+    Extended,
+    Filter,
+    Kalman,
+    KalmanWeight,
+    Luenberger,
+    OfflineEstimate,
+    Prediction,
+    RobustKalman,
+    State,
+    Unscented,
+    dual_iterations,
+    estimate_offline,
+    norm_bounded,
+    polytopic_horizon,
+)
+from ctmhe.models import ContinuousModel, DiscreteModel, mixture, polytope
 from ctmhe.models.fmu import FmuModel
 from ctmhe.simulation import (
     Everything,
@@ -24,8 +41,9 @@ from ctmhe.simulation import (
     replay,
     simulate,
 )
+from ctmhe.solvers.dual import DualIterations
 from ctmhe.studies import Study, StudyResult, explore, find_threshold, latin_hypercube, pareto_front, sobol
-from ctmhe.transcription import CVODES, RK4
+from ctmhe.transcription import CVODES, RK4, Exact
 from ctmhe.triggers import (
     BoundSelfTriggered,
     Budget,
@@ -72,6 +90,7 @@ __all__ = [
     "CVODES",
     "MHE",
     "RK4",
+    "AdaptiveArrival",
     "BoundSelfTriggered",
     "Bounds",
     "Budget",
@@ -84,11 +103,15 @@ __all__ = [
     "DetectabilityCertificate",
     "DiscountedCost",
     "DiscreteModel",
+    "DualIterations",
     "During",
     "DutyCycle",
     "Estimate",
     "Everything",
+    "Exact",
     "Excitation",
+    "Extended",
+    "Filter",
     "FmuError",
     "FmuModel",
     "FmuPlant",
@@ -101,9 +124,11 @@ __all__ = [
     "Input",
     "InputError",
     "Jittered",
+    "Kalman",
     "KalmanWeight",
     "LevelCrossing",
     "LinearGaps",
+    "Luenberger",
     "MaxInterval",
     "Measurement",
     "MeasurementLog",
@@ -120,6 +145,7 @@ __all__ = [
     "Poisson",
     "Prediction",
     "Recorded",
+    "RobustKalman",
     "Run",
     "Scheduled",
     "SendOnArea",
@@ -138,14 +164,20 @@ __all__ = [
     "TriggerContext",
     "TriggerError",
     "Uniform",
+    "Unscented",
     "WholeSignal",
     "certify_detectability",
     "check_fmu",
+    "dual_iterations",
     "estimate_offline",
     "explore",
     "find_threshold",
     "latin_hypercube",
+    "mixture",
+    "norm_bounded",
     "pareto_front",
+    "polytope",
+    "polytopic_horizon",
     "replay",
     "simulate",
     "sobol",

@@ -50,13 +50,24 @@ class Estimator(Protocol):
         An input that becomes known changes what was predicted before it.
     """
 
-    model: Model
-    horizon: float
-    interval: float
+    @property
+    def model(self) -> Model:
+        """The model."""
+        ...
+
+    @property
+    def horizon(self) -> float:
+        """Seconds of data that an estimate uses."""
+        ...
+
+    @property
+    def interval(self) -> float:
+        """Seconds from one edge to the next."""
+        ...
 
     @property
     def hold(self) -> Mapping[str, str]:
-        """How samples enter, by output."""
+        """How samples enter."""
         ...
 
     @property

@@ -231,7 +231,8 @@ class Filter:
             filtering=False,
         )
         self._basis = Basis(model, self.stage, self.assembly, held)
-        if not held and any(ca.which_depends(model.output(*_symbols(model)), _symbols(model)[3], 1, False)):
+        symbols = [ca.MX.sym(name, model.output.size1_in(i)) for i, name in enumerate("txuwp")]
+        if not held and len(model.w) and any(ca.which_depends(model.output(*symbols), symbols[3], 1, False)):
             raise InputError(
                 f"filter: outputs of {model.name!r} depend on w, and a sample of white noise has no finite variance. "
                 "Leave the measurement noise out of w and state it by R_point, or hold w by interval=..."
@@ -513,10 +514,6 @@ class Filter:
         if (len(state.x), state.measurements.width) != (len(self.model.x), len(self.model.y)):
             raise InputError(f"this state belongs to another model than {self.model.name!r}: it has other signals")
         return state
-
-
-def _symbols(model: Model) -> list[Any]:
-    return [ca.MX.sym(name, model.output.size1_in(i)) for i, name in enumerate("txuwp")]
 
 
 def _rebuild(configuration: dict[str, Any]) -> Filter:

@@ -8,7 +8,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from ctmhe.errors import InputError
 from ctmhe.estimators.filter import Basis, Recursion, Sample, Slot
@@ -127,6 +126,8 @@ class Bounded:
 
         X has the larger part because what makes P small now makes X, and so the next P, grow.
         """
+        from scipy.optimize import minimize_scalar  # of SciPy only what is needed, when it is
+
         nx, M, E = len(P), self.M, self.E
         X = X[:nx, :nx]
         limit = 1.0 / max(float(np.linalg.eigvalsh(E @ X @ E.T)[-1]), 1e-300)

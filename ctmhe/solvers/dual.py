@@ -6,12 +6,11 @@ from dataclasses import dataclass, replace
 
 import casadi as ca
 import numpy as np
-from scipy.optimize import nnls
 
 from ctmhe.errors import InputError
 from ctmhe.solvers.base import Solution, Solver
 from ctmhe.transcription.integrators import is_symbolic
-from ctmhe.transcription.problem import Guess, Window, cost_of
+from ctmhe.transcription.problem import Guess, Window, bound_violation, cost_of
 from ctmhe.transcription.stage import StageFunction
 from ctmhe.transcription.weights import square_root
 from ctmhe.types import Array, Outcome, positive
@@ -114,9 +113,10 @@ class _Turns:
 
     def _weights(self, window: Window, cells: np.ndarray, solution: Solution) -> tuple[Guess, Array, float]:
         """Solve (11): weights for given states at the edges of cells. Return point, outputs and cost, never larger."""
-        point, slack = solution.point, 1e-12 * window.w_scale
+        point = solution.point
         found, r, J, by_alpha = self._followed(window, point, cells, point.p)
         before = cost_of(window, *found)
+        allowed = max(1e-9, bound_violation(window, found[0], found[1][:, -1]))
         move = simplex_least_squares(J, J @ point.p - r) - point.p
         for share in 0.5 ** np.arange(30):  # where the model is affine in the weights the whole move is best
             step = share * move
@@ -129,17 +129,18 @@ class _Turns:
                     trial = self._followed(window, point, cells, point.p + step)[0]
                 except FloatingPointError:
                     continue
-            w, total = trial[0].w, cost_of(window, *trial)
-            if total <= before and ((w >= window.w_lower - slack) & (w <= window.w_upper + slack)).all():
-                return *trial, total
-        return *found, before
+            total = cost_of(window, *trial)
+            if total <= before and bound_violation(window, trial[0], trial[1][:, -1]) <= allowed:
+                return trial[0], trial[1], total
+        return found[0], found[1], before
 
     def _followed(
         self, window: Window, point: Guess, cells: np.ndarray, alpha: Array
     ) -> tuple[tuple[Guess, Array], Array, Array, tuple[Array, Array]]:
         """Return the trajectory of some weights through the states at the edges of cells, residuals and Jacobian.
 
-        Last come the derivatives of w and y by the weights. The disturbance of a cell is what leads to the next edge: the model is linear in it. `cells` (N,) numbers them.
+        Last come the derivatives of w and y by the weights. The disturbance of a cell is what leads to its end: the
+        model is linear in it. `cells` (N,) numbers them.
         """
         stage, mesh, n = self.stage, window.mesh, len(window.mesh)
         nx, nw, q = stage.nx, stage.nw, stage.np
@@ -191,6 +192,8 @@ def simplex_least_squares(J: Array, b: Array) -> Array:
     On the simplex J a - b = D a with D = J - b 1'. The minimiser of |D a|^2 + (1'a - 1)^2 over a >= 0 is a multiple of
     the one sought, whatever the size of D: along a ray the best multiple costs f / (1 + f), which grows with f.
     """
+    from scipy.optimize import nnls  # of SciPy only what is needed, when it is
+
     D = J - b[:, None]
     D = D / max(float(np.linalg.norm(D)), 1e-300)
     a, _ = nnls(np.vstack([D, np.ones(D.shape[1])]), np.append(np.zeros(len(D)), 1.0))

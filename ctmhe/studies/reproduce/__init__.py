@@ -8,11 +8,15 @@ from typing import Any
 from ctmhe.errors import InputError
 from ctmhe.studies.reproduce import (
     certified_runs,
+    paper003_1,
+    paper003_2,
     paper_000_5,
     study_reactor_budget,
     study_solves_saved,
     thesis_3_4_1_certificate,
     thesis_3_4_1_ct,
+    thesis_3_4_1_dt,
+    thesis_3_4_2,
     thesis_3_4_2_certificate,
     thesis_4_3_3_horizons,
     thesis_5_2_4,
@@ -55,6 +59,10 @@ CASES: dict[str, Callable[..., dict[str, Any]]] = {
     "thesis-6.4.2-quadrotor": thesis_6_4_2_quadrotor.reproduce,
     "thesis-table-6.1": thesis_table_6_1.reproduce,
     "thesis-table-6.2": thesis_table_6_2.reproduce,
+    "thesis-3.4.1-dt": thesis_3_4_1_dt.reproduce,
+    "thesis-3.4.2": thesis_3_4_2.reproduce,
+    "paper003-1": paper003_1.reproduce,
+    "paper003-2": paper003_2.reproduce,
     "study-reactor-budget": study_reactor_budget.reproduce,
     "study-solves-saved": study_solves_saved.reproduce,
 }

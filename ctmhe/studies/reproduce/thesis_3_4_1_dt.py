@@ -134,6 +134,6 @@ def reproduce(*, seeds: int = 20, workers: int = 1, progress: bool = False, step
 COMMENT = (
     "Fig. 3.1 shows one run and no numbers; the covariances of the EKF are not printed. With P0 = 36 I, Q = 1e-6 I and "
     "R = 1e-2 it leaves the physical domain, as in the figure. `MHE` has the printed weights; `MHE, certified` the "
-    "largest P that meets the condition with the printed Q, R and eta, of which the printed one is a rounding, and so a "
-    "bound (3.20): `error over its bound` is the largest ratio of a run, which must stay below one."
+    "largest P that meets the condition with the printed Q, R and eta, of which the printed one is a rounding, and so "
+    "a bound (3.20): `error over its bound` is the largest ratio of a run, which must stay below one."
 )
