@@ -110,7 +110,8 @@ def reproduce(*, seeds: int = 100, steps: int = STEPS, workers: int = 1, progres
 
 
 COMMENT = (
-    "The input sequence is not printed; ours flies a rising spiral. The published changes are read off a boxplot and "
-    "said to be approximate. Filtering and turnpike prior are alike, the smoothing prior is somewhat worse, and half a "
-    "horizon of delay comes close to the infinite-horizon estimate, as published."
+    "The input sequence is not printed; ours flies a rising spiral. The published changes are read off a boxplot "
+    "and said to be approximate. Filtering and turnpike prior are alike and the smoothing prior is somewhat "
+    "worse, as published. The infinite-horizon estimate is 66 per cent better than standard MHE, so half a "
+    "horizon of delay, called close to it, still leaves something."
 )
