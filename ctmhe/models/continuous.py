@@ -104,6 +104,7 @@ class ContinuousModel:
     """
 
     step: float | None = None
+    controls: Signals | None = None  # those of the inputs that are not measurements, for `observer_model`
 
     def __init__(
         self,

@@ -13,7 +13,7 @@ import numpy as np
 from ctmhe.solvers.base import Multipliers, Solution, clip_to_bounds
 from ctmhe.transcription.problem import Guess, Window, bound_violation, cost_of
 from ctmhe.transcription.stage import StageFunction
-from ctmhe.types import Array
+from ctmhe.types import Array, Outcome
 
 logger = logging.getLogger(__name__)
 
@@ -31,6 +31,8 @@ OPTIONS: dict[str, Any] = {
     "calc_lam_p": False,
 }
 
+SMALLEST = 4  # slots that a program has room for at least
+EXPANDED = 5_000  # instructions of all slots up to which the program is expanded to scalars
 LARGE = 20_000  # instructions of a slot up to which it becomes one scalar expression
 
 
@@ -55,13 +57,18 @@ class Ipopt:
     stage : StageFunction
     options : mapping, optional
         IPOPT options that replace the defaults (`tol=1e-10`, `bound_relax_factor=0`).
+    max_iterations : int, optional
+        Stop there; the iterate need not be feasible. 200, after which a solve has failed, when left out.
     """
 
     name = "IPOPT"
 
-    def __init__(self, stage: StageFunction, *, options: dict[str, Any] | None = None):
-        self.stage = stage
-        self.options = OPTIONS | (options or {})
+    def __init__(
+        self, stage: StageFunction, *, options: dict[str, Any] | None = None, max_iterations: int | None = None
+    ):
+        self.stage, self.limited = stage, max_iterations is not None
+        limit = {"ipopt.max_iter": max_iterations} if self.limited else {}
+        self.options = OPTIONS | limit | (options or {})
         self.built = 0
         self._programs: dict[bool, _Program] = {}
         self._lock = Lock()  # statistics belong to the last call: one at a time
@@ -152,12 +159,13 @@ class Ipopt:
             feasibility,
             iterations,
             Multipliers(dynamics, zx, zw, zy, zp),
+            Outcome.ITERATION_LIMIT if self.limited and status == "Maximum_Iterations_Exceeded" else None,
         )
 
     def _program(self, n: int, output_bounded: bool) -> _Program:
         program = self._programs.get(output_bounded)
         if program is None or program.capacity < n:
-            capacity = 16
+            capacity = SMALLEST
             while capacity < n:
                 capacity *= 2
             logger.info("IPOPT: building the program for %d slots (window has %d)", capacity, n)
@@ -200,6 +208,8 @@ class Ipopt:
             "g": ca.vertcat(*constraints),
         }
         options = dict(self.options)
+        if slot.is_a("SXFunction") and size * slot.n_instructions() < EXPANDED:
+            options["expand"] = True  # one scalar program instead of calls: small ones are all overhead
         if not stage.symbolic:
             options["hess_lag"] = _gauss_newton_hessian(problem, every)
         solver = ca.nlpsol("reference", "ipopt", problem, options)

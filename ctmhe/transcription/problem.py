@@ -122,11 +122,7 @@ def rollout(stage: StageFunction, window: Window, x: Array, p: Array, w: Array |
     mesh = window.mesh
     n = len(mesh)
     w = np.zeros((n, stage.nw)) if w is None else w
-    states = np.empty((n + 1, stage.nx))
-    states[0] = x
-    for k in range(n):
-        states[k + 1], _ = stage.step(mesh.t[k], mesh.h[k], states[k], w[k], p, window.u0[k], window.u1[k])
-    return Guess.of(states, w, p, stage.ny)
+    return Guess.of(stage.roll(mesh.t[:-1], mesh.h, x, w, p, window.u0, window.u1), w, p, stage.ny)
 
 
 def bound_violation(window: Window, guess: Guess, y_end: Array) -> float:

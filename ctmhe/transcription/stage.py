@@ -138,6 +138,16 @@ class StageFunction:
             y[-1] = rows[-1]
         return x, y
 
+    def roll(self, t: Array, h: Array, x: Array, w: Array, p: Array, u0: Array, u1: Array) -> Array:
+        """Carry x (nx,) through N slots, one after the other: return the states (N+1, nx)."""
+        if self.steps == 1:
+            return self._scratch().roll(t, h, x, w, p, u0, u1)
+        states = np.empty((len(t) + 1, self.nx))
+        states[0] = x
+        for k in range(len(t)):
+            states[k + 1], _ = self.step(t[k], h[k], states[k], w[k], p, u0[k], u1[k])
+        return states
+
     def output(self, t: float, x: Array, u: Array, w: Array, p: Array) -> Array:
         """Return h(t, x, u, w, p), (ny,)."""
         bound = self._scratch().output
@@ -225,6 +235,26 @@ class _Scratch:
         self.stage = stage
         self.bound = [[_bind(function, size) for size, function in group.items()] for group in stage.mapped]
         self.output = _bind(stage.model.output, 1)
+        self.rolling: list[_Bound] = []
+
+    def roll(self, t: Array, h: Array, x: Array, w: Array, p: Array, u0: Array, u1: Array) -> Array:
+        """Carry x through N slots with functions that hold as many steps as there are in a chunk."""
+        if not self.rolling:
+            self.rolling = _bind_rolls(self.stage.value)
+        n, start = len(t), 0
+        arrays = (t[:, None], h[:, None], w, np.broadcast_to(p, (n, self.stage.np)), u0, u1)
+        states = np.empty((n + 1, self.stage.nx))
+        states[0] = x
+        for bound in self.rolling:
+            while n - start >= bound.size:
+                stop = start + bound.size
+                bound.inputs[0][:] = states[start]
+                for array, value in zip(bound.inputs[1:], arrays, strict=True):
+                    array[:] = value[start:stop]
+                bound.run()
+                states[start + 1 : stop + 1] = bound.outputs[0]
+                start = stop
+        return states
 
     def one(self, *values) -> tuple[Array, Array]:
         bound = self.bound[0][-1]
@@ -262,6 +292,23 @@ def _bind(function: ca.Function, size: int) -> _Bound:
         outputs.append(
             np.zeros((size, rows) if columns == 1 and i < 2 and function.n_out() > 1 else (size, columns, rows))
         )
+    return _bound(function, size, inputs, outputs)
+
+
+def _bind_rolls(value: ca.Function) -> list[_Bound]:
+    """Return functions that take a chunk of steps, with memory for one state, their arguments, and the states."""
+    names = [value.name_in(i) for i in range(value.n_in())]
+    symbols = [ca.MX.sym(name, value.size1_in(i)) for i, name in enumerate(names)]
+    one = ca.Function("roll", [symbols[2], *symbols[:2], *symbols[3:]], [value(*symbols)[0]])
+    bound = []
+    for size in CHUNKS:
+        function = one.mapaccum(size)
+        inputs = [np.zeros((function.size2_in(i), function.size1_in(i))) for i in range(function.n_in())]
+        bound.append(_bound(function, size, inputs, [np.zeros((size, function.size1_out(0)))]))
+    return bound
+
+
+def _bound(function: ca.Function, size: int, inputs: list[Array], outputs: list[Array]) -> _Bound:
     buffer, trigger = function.buffer()
     for i, array in enumerate(inputs):
         if array.size:
