@@ -70,6 +70,28 @@ class Track:
     key: str = ""
 
 
+@dataclass(frozen=True)
+class WindowStart:
+    """What is known of a window whose prior is not the filtering prior: thesis 4.2.
+
+    Attributes
+    ----------
+    prior : float
+        Bound of |x_bar - x|^2_P_upper at the window's start.
+    theorem : float or None
+        Bound of U at the window's end by a theorem of its own.
+    reasons : tuple of str
+        Why there is none.
+    factor : float
+        On the cost: 1 / eta where the newest output is counted in it.
+    """
+
+    prior: float
+    theorem: float | None
+    reasons: tuple[str, ...] = ()
+    factor: float = 1.0
+
+
 @dataclass(frozen=True, eq=False)
 class WindowBounds:
     """The bounds along a run of one estimator.
@@ -161,11 +183,18 @@ class WindowBounds:
         return min(self.certificate.ratio * self.at(track, start), self.cap)
 
     def after(
-        self, track: Track, start: float, t: float, cost: float, problems: Sequence[str] = ()
+        self,
+        track: Track,
+        start: float,
+        t: float,
+        cost: float,
+        problems: Sequence[str] = (),
+        given: WindowStart | None = None,
     ) -> tuple[Track, ErrorBound]:
         """Return the track and the bound after a solve at `t` of the window from `start`.
 
-        `problems` say why the window is not what the theory is about; U is then bounded by the domain only.
+        `problems` say why the window is not what the theory is about; U is then bounded by the domain only. `given` is
+        what is known of its prior, if that is not the filtering prior: Theorem 3.1 then says nothing.
         """
         ends, levels, near = track.ends, track.levels, self.near(t)
         if ends and t <= ends[-1] + near:  # a solve repeated takes its own place
@@ -176,13 +205,16 @@ class WindowBounds:
         equal = gap <= near or abs(gap - period) <= near
         equal &= start <= track.start + near or any(abs(end - start) <= near for end in ends)
         past = replace(track, wait=max(track.wait, gap), period=period if equal else np.nan)
-        most = 2 * (self.fade(t - start) * self.before(track, start) + self.energy(t - start))
-        level = min(most + cost, self.cap) if not problems else self.cap
+        before = self.before(track, start) if given is None else min(given.prior, self.cap)
+        most = 2 * (self.fade(t - start) * before + self.energy(t - start))
+        level = min(most + cost * (given.factor if given else 1.0), self.cap) if not problems else self.cap
         kept = [k for k, end in enumerate(ends) if end > t - self.horizon - near]
         past = replace(past, ends=(*(ends[k] for k in kept), t), levels=(*(levels[k] for k in kept), level))
-        reasons = tuple(problems) or self._unmet(past, cost, most)
+        reasons = tuple(problems) or (self._unmet(past, cost, most) if given is None else given.reasons)
         theorem = None
-        if reasons:
+        if given is not None:
+            theorem = None if reasons else given.theorem
+        elif reasons:
             past = replace(past, since=t, base=self._worst(past), wait=0.0)
         else:
             theorem = self._theorem(past, t)

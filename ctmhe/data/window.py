@@ -65,3 +65,35 @@ def point_rows(times: Array, edges: Array, tolerance: float) -> tuple[Array, Arr
     edge = np.where(np.abs(edges[below] - times) < np.abs(edges[edge] - times), below, edge)
     hit = np.abs(edges[edge] - times) <= tolerance
     return np.flatnonzero(hit), edge[hit]
+
+
+def fed_inputs(
+    inputs: tuple[Array, Array], measured: tuple[Array, Array], limit: float, cut: float = np.inf
+) -> tuple[Array, Array]:
+    """Return times and rows (u, y, known) of an observer that is fed with the measurements: see `observer_model`.
+
+    Parameters
+    ----------
+    inputs : (times (m,), rows (m, nu))
+        Held; before the first the first.
+    measured : (times (n,), rows (n, ny))
+        NaN where a sensor is silent. What a sensor said counts until it speaks again, or for `limit` seconds; then, and
+        from `cut` seconds on, nothing of it is known: y and known are zero.
+    """
+    (u_times, u), (y_times, y) = inputs, measured
+    spoken = np.isfinite(y)
+    ends = np.minimum(y_times + limit, cut)
+    nu, ny, near = u.shape[1], y.shape[1], 1e-9 * min(limit, 1.0)
+    times = np.unique(np.concatenate([u_times, y_times, ends[np.isfinite(ends)]]))
+    times = times[np.diff(times, append=np.inf) > near]  # a sample at which another expires is one time
+    rows = np.zeros((len(times), nu + 2 * ny))
+    if nu and len(u_times):
+        rows[:, :nu] = u[np.clip(np.searchsorted(u_times, times + near, side="right") - 1, 0, len(u_times) - 1)]
+    for s in range(ny):
+        own, values = y_times[spoken[:, s]], y[spoken[:, s], s]
+        i = np.searchsorted(own, times + near, side="right") - 1
+        if len(own):
+            known = (i >= 0) & (times < np.minimum(own[i] + limit, cut) - near)
+            rows[:, nu + s] = np.where(known, values[i], 0.0)
+            rows[:, nu + ny + s] = known
+    return times, rows

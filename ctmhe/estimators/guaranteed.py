@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from ctmhe.certificates.certificate import DetectabilityCertificate
-from ctmhe.certificates.guarantee import Guarantee, Track, WindowBounds, largest_square
+from ctmhe.certificates.guarantee import Guarantee, Track, WindowBounds, WindowStart, largest_square
 from ctmhe.errors import InputError
 from ctmhe.estimators.priors import Filtering
 from ctmhe.models.continuous import Model, box_arrays
@@ -49,6 +49,7 @@ class Guaranteed:
             )
         self.guarantee, self.model = guarantee, model
         sizes = np.abs(model.w.vector(_spread(guarantee.disturbance, nw), "guarantee: disturbance"))
+        self.sizes = sizes
         lower, upper = box_arrays(model.x, own.domain.x if own.domain else None, "domain of x")
         self.domain = lower, upper
         certificate, problems = _scaled(own, mhe)
@@ -104,14 +105,16 @@ class Guaranteed:
             return fresh
         return self.bounds.resumed(replace(fresh, ends=(t,), levels=(self.bounds.cap,)), t, since=t)
 
+    def first_error(self, x: Array) -> Array:
+        """Return how wrong the initial estimate `x` (nx,) can be, state by state (nx,)."""
+        if self.guarantee.error is not None:
+            return np.abs(self.model.x.vector(_spread(self.guarantee.error, len(x)), "guarantee: error"))
+        lower, upper = self.domain
+        return np.maximum(upper - x, x - lower)
+
     def begin(self, t: float, x: Array) -> Track:
         """Return the track at the start: how wrong the initial estimate `x` (nx,) can be."""
-        lower, upper = self.domain
-        sizes = np.maximum(upper - x, x - lower)
-        if self.guarantee.error is not None:
-            given = _spread(self.guarantee.error, len(x))
-            sizes = np.abs(self.model.x.vector(given, "guarantee: error"))
-        return Track(t, largest_square(self.bounds.certificate.P_upper, sizes), key=self.bounds.key)
+        return Track(t, largest_square(self.bounds.certificate.P_upper, self.first_error(x)), key=self.bounds.key)
 
     def current(self, doubts: Doubts, times: Array, start: float) -> Doubts:
         """Return the doubts that concern windows from `start` on: what is wrong stays held until the next record."""
@@ -120,17 +123,28 @@ class Guaranteed:
         return tuple(doubt for doubt, until in zip(doubts, ahead, strict=True) if until > start + near)
 
     def after(
-        self, track: Track, start: float, t: float, cost: float, status: Status, reasons: Sequence[str]
+        self,
+        track: Track,
+        start: float,
+        t: float,
+        cost: float,
+        status: Status,
+        reasons: Sequence[str],
+        given: WindowStart | None = None,
     ) -> tuple[Track, ErrorBound]:
-        """Return the track and the bound after a solve; `reasons` say what is doubtful or lacking in its window."""
+        """Return the track and the bound after a solve; `reasons` say what is doubtful or lacking in its window.
+
+        `given` is what a suboptimal estimator knows of its prior; its estimates are trajectories of the model.
+        """
         found = list(dict.fromkeys(reasons))
         problems = list(self.unmet)
         problems += found[-1:] if len(found) < 2 else [f"{found[-1]}, and {len(found) - 1} more like it in this window"]
-        if not (status.outcome in (Outcome.SOLVED, Outcome.FALLBACK) and status.success):
+        solved = status.outcome in (Outcome.SOLVED, Outcome.FALLBACK) and status.success
+        if not (solved if given is None else status.outcome not in (Outcome.RELAXED, Outcome.PREDICTED)):
             problems.append(f"the estimate need not be a trajectory of the model: {status.outcome.value}")
         if t > start and "prior predicted, uncertified" in status.notes:
             problems.append("prior predicted, uncertified")
-        return self.bounds.after(track, start, t, cost, problems)
+        return self.bounds.after(track, start, t, cost, problems, given)
 
 
 def _governing(times: Array, t: float) -> float:
@@ -171,9 +185,13 @@ def _scaled(own: DetectabilityCertificate, mhe: MHE) -> tuple[DetectabilityCerti
     varying = [name for name in "PQR" if callable(getattr(cost, name))]
     if varying:
         problems.append(f"weight {', '.join(varying)} varies in time: Remark 3.4 needs bounds for that")
-    if cost.prior_eta != cost.eta:
+    if mhe.suboptimal is not None:
+        for name, value in (("eta", cost.eta), ("prior_eta", cost.prior_eta)):
+            if value is not None and value < own.eta * (1 - 1e-12):
+                problems.append(f"{name} = {value:g} is below the certificate's {own.eta:g} (4.12)")
+    elif cost.prior_eta != cost.eta:
         problems.append(f"prior_eta = {cost.prior_eta:g} differs from eta = {cost.eta:g}: (3.13) has one discount")
-    if not isinstance(mhe.prior, Filtering):
+    if not (mhe.suboptimal is not None or isinstance(mhe.prior, Filtering)):
         problems.append("the prior is not the filtering prior (3.18)")
     if cost.S is not None:
         problems.append("the terminal weight S is not part of (3.13)")
@@ -183,7 +201,7 @@ def _scaled(own: DetectabilityCertificate, mhe: MHE) -> tuple[DetectabilityCerti
     weights = [weight_matrix(getattr(cost, key), group, key) for key, group in zip("PQR", names, strict=True)]
     P, Q, R = weights[0] / 2, weights[1] / 2, weights[2]
     same = ((P, own.P_upper), (Q, own.Q), (R, own.R))
-    eta = float(cost.eta or 1.0)
+    eta = own.eta if mhe.suboptimal is not None else float(cost.eta or 1.0)  # that of U, whatever the cost's (4.41)
     if abs(eta - own.eta) <= 1e-12 and all(np.allclose(a, b, rtol=1e-12, atol=0.0) for a, b in same):
         return own, []
     try:
@@ -206,7 +224,7 @@ def _unmet(own: DetectabilityCertificate, mhe: MHE) -> list[str]:
         problems.append(
             "the model has no measurement noise in every output, which has to account for holding records: add it to w"
         )
-    if mhe.assembly.filtering:
+    if mhe.assembly.filtering and mhe.suboptimal is None:
         problems.append("the filtering form (3.6) has no bound here: leave filtering out")
     for key, group in (("x", model.x), ("w", model.w)):
         wanted = box_arrays(group, getattr(own.domain, key) if own.domain else None, f"domain of {key}")

@@ -13,15 +13,17 @@ from typing import Any
 
 import numpy as np
 
-from ctmhe.certificates.guarantee import Guarantee
+from ctmhe.certificates.guarantee import Guarantee, WindowStart
 from ctmhe.data.log import Log
-from ctmhe.data.window import held_inputs
+from ctmhe.data.window import fed_inputs, held_inputs
 from ctmhe.errors import InputError, NotEstimated, TooLate
+from ctmhe.estimators.decrease import improved
 from ctmhe.estimators.guaranteed import Guaranteed
 from ctmhe.estimators.guesses import open_loop, resting_guess, starting_points
 from ctmhe.estimators.outlook import carried_covariance, prior_covariance
 from ctmhe.estimators.priors import Anchor, Filtering, Prior, prior_of
 from ctmhe.estimators.state import State, load_state, save_state
+from ctmhe.estimators.suboptimal import Suboptimal
 from ctmhe.estimators.trajectories import empty_path, path_at, path_rows, trajectory_at
 from ctmhe.models.continuous import Model
 from ctmhe.models.signals import Signals
@@ -173,15 +175,23 @@ class MHE:
         self.model, self.clock = model, clock
         if not isinstance(model, Model):
             raise InputError(f"model must be a ContinuousModel, DiscreteModel or FmuModel, got {type(model).__name__}")
+        own: Signals | None = getattr(model, "controls", None)
+        self.fed, self.controls = own is not None, model.u if own is None else own
         if bounds is not None and not isinstance(bounds, Bounds):
             raise InputError(f"bounds must be a Bounds(x=..., w=..., p=..., y=..., residual=...), got {bounds!r}")
-        if not (max_iterations is None or (isinstance(max_iterations, int) and max_iterations > 0)):
-            raise InputError(f"max_iterations must be a positive integer, got {max_iterations!r}")
+        self.suboptimal = prior if isinstance(prior, Suboptimal) else None
+        least = 1 if self.suboptimal is None else 0
+        if not (max_iterations is None or (isinstance(max_iterations, int) and max_iterations >= least)):
+            zero = " (0 needs a candidate: prior=Suboptimal(...))" if max_iterations == 0 else ""
+            raise InputError(f"max_iterations must be a positive integer, got {max_iterations!r}{zero}")
         if deadline is not None:
             deadline = positive("deadline", deadline, "seconds")
         self._real_time = max_iterations is not None or deadline is not None
-        if self._real_time and solver == "ipopt":
-            raise InputError("max_iterations and deadline are for Gauss-Newton; IPOPT runs to convergence")
+        if solver == "ipopt" and (deadline is not None or (max_iterations is not None and self.suboptimal is None)):
+            raise InputError(
+                "deadline is for Gauss-Newton, and so is max_iterations unless a candidate guards the iterate "
+                "(prior=Suboptimal(...)): IPOPT runs to convergence"
+            )
         self.horizon = np.inf if horizon == np.inf else positive("horizon", horizon, "seconds")
         self.prior = prior_of(prior)
         if model.step is not None:
@@ -226,10 +236,11 @@ class MHE:
         )
         self.guaranteed = None if guarantee is None else Guaranteed(guarantee, self)
         limits: dict[str, Any] = {"max_iterations": max_iterations or 100, "deadline": deadline, "clock": clock}
+        limited = {"max_iterations": max_iterations} if max_iterations and self.suboptimal is not None else {}
         if tolerance is not None:
             limits["tolerance"] = positive("tolerance", tolerance)
         self._gauss_newton = GaussNewton(self.stage, **limits)
-        self._reference = Ipopt(self.stage)
+        self._reference = Ipopt(self.stage, **limited)
         # how often a model that is not ours (an FMU) could not be evaluated, and the last time in words
         self._failures: Callable[[], tuple[int, str]] | None = getattr(model, "failures", None)
         compile = compile or os.environ.get("CTMHE_COMPILE") or "auto"
@@ -241,6 +252,7 @@ class MHE:
             choice = {"specialise": compile == "auto", "p_estimated": self.assembly.p_estimated}
             compiled = compiled_solver(self.stage, **choice, **limits)
             self._solver = compiled or self._gauss_newton
+        self._idle = max_iterations == 0
         self._covariance = (compiled or self._gauss_newton).covariance
         self._layout = Layout.of(self.stage)
         self._updates = None
@@ -249,6 +261,10 @@ class MHE:
         self._check = Ipopt(self.stage, options={"ipopt.mu_init": 1e-8}) if verify else None
         self._holds = bool(self.assembly.held.any())
         self._silent, self._unmeasured = np.zeros(len(model.w)), np.empty((0, len(model.y)))
+        if self.suboptimal is not None:
+            unmet = self.suboptimal.bound(self).bounds.unmet
+            if self.guaranteed is not None:
+                self.guaranteed.unmet = (*self.guaranteed.unmet, *unmet)
         self._widths = (self.stage.nx + self.stage.np, self.stage.ny)  # of a state of this estimator
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -284,9 +300,9 @@ class MHE:
         model = self.model
         x0 = model.x.vector(x, "init")
         p0 = model.p.vector(model.p_start if p is None else self._named(model.p, p, model.p_start), "init")
-        inputs = Log(len(model.u))
+        inputs = Log(len(self.controls))
         u_start = getattr(model, "u_start", None)
-        if len(model.u) and u_start is not None:
+        if len(self.controls) and u_start is not None:
             inputs = inputs.put(t, frozen(u_start))
         start = frozen(np.concatenate([x0, p0]))
         state = State(t, t, start, x0, p0, Log(len(model.y)), inputs, empty_path(self.stage), t)
@@ -313,8 +329,10 @@ class MHE:
         """Return the state whose bounds do not rest on what was solved with other data at `t` and later."""
         if self.guaranteed is None or state.track is None or t >= state.t - self.slack(t):
             return state
-        track = self.guaranteed.bounds.resumed(state.track, state.t, since=t)
-        return made(State, state.__dict__ | {"track": track})
+        fields: dict[str, Any] = {"track": self.guaranteed.bounds.resumed(state.track, state.t, since=t)}
+        if self.suboptimal is not None:
+            fields["memory"] = self.suboptimal.revised(state.memory, t)
+        return made(State, state.__dict__ | fields)
 
     @staticmethod
     def _named(signals: Signals, values: Any, default: Array) -> Any:
@@ -362,8 +380,8 @@ class MHE:
         if not isinstance(value, Input):
             raise InputError(f"control expects an Input(t, u), got {type(value).__name__}")
         u: Any = value.u
-        if not self.model.u.complete(u):
-            u = self.model.u.vector(u, f"input at t = {value.t:g}")
+        if not self.controls.complete(u):
+            u = self.controls.vector(u, f"input at t = {value.t:g}")
         if state.solves:
             self._check_age(state, value.t, "input")
         return self._revised(state, value.t).knowing(state.measurements, state.inputs.put(value.t, u))
@@ -424,9 +442,11 @@ class MHE:
         failing = self._failures
         failures = failing()[0] if failing else 0
         since = state.since if t == state.t else state.t  # a solve repeated with what has arrived takes its own place
+        if self.suboptimal is not None:
+            return self._improve(state, t, since, failures, began)
         if self._updates is not None:
-            logs = (state.measurements, state.inputs, state.path)
             span, growing = self._span(state, t)
+            logs = self._logs(state, *span)
             anchor, notes = self._anchor(state, span, growing)
             request = (span, growing, *logs, state.window, state.p, (state.t, since), anchor)
             update = self._updates.run(*request, state.prepared)
@@ -448,6 +468,45 @@ class MHE:
         solved = self._packed(window, solution)
         added = path_rows(solved.trajectory, since)
         return self._conclude(state, t, since, solved, added, solution.cost, status, began)
+
+    def _improve(self, state: State, t: float, since: float, failures: int, began: float) -> tuple[State, Estimate]:
+        """Return what `estimate` does with a candidate at hand: no estimate costs more (4.15)."""
+        rule, growing = self.suboptimal, self._span(state, t)[1]
+        assert rule is not None
+        span = self._span(state, t)[0]
+        anchor, notes = self._anchor(state, span, growing)
+        window = None
+        if self._updates is not None:
+            logs, last = self._logs(state, *span), state.window
+            found = self._updates.assembled(span, growing, *logs, last, state.p, (state.t, since), anchor)
+            window = None if found is None else found[0]
+        if window is None:
+            window, notes = self._window(state, t)
+        elif not window.L_y.any():
+            notes = (*notes, "no measurement in window")
+        bound = rule.bound(self)
+        run = rule.simulate(self, state, window)
+        candidate = rule.propose(self, state, window, run)
+        start = candidate if self._idle else rule.first_guess(self, state, window, candidate)
+        notes = tuple(dict.fromkeys((*notes, *run.notes, *bound.note(window, run.x, self.model.x.names))))
+        solver = None if self._idle else self._solver
+        solution, status, kept = improved(
+            self.stage, window, solver, candidate, start, process=bound.process, exact=bound.affine, notes=notes
+        )
+        if status.outcome is Outcome.PREDICTED:
+            solution = open_loop(self.stage, state, window)
+        given = None if self.guaranteed is None else rule.known(self, state, window, run, candidate, kept)
+        state = made(State, state.__dict__ | {"memory": rule.advanced(self, state, t)})
+        solved, status = self._packed(window, solution), self._told(status, failures)
+        added = path_rows(solved.trajectory, since)
+        return self._conclude(state, t, since, solved, added, solution.cost, status, began, given, run.since)
+
+    def _logs(self, state: State, start: float, end: float) -> tuple[Log, Log, Log]:
+        """Return what the core reads."""
+        if not self.fed:
+            return state.measurements, state.inputs, state.path
+        times, rows = self._known_inputs(state, start, end, fed_until=np.inf)
+        return state.measurements, Log.of(times, rows, rows.shape[1]), state.path
 
     def prepare(self, state: State, t: float, *, outputs: Iterable[str] | None = None) -> State:
         """Do what can be done for the estimate at `t` before the newest measurement is there.
@@ -478,7 +537,7 @@ class MHE:
             raise NotEstimated(f"prepare at t = {t:g} s lies before the last estimate at {state.t:g} s")
         expected = np.full(len(self.model.y), np.nan)
         expected[[self.model.y.index(name) for name in (self.model.y.names if outputs is None else outputs)]] = 0.0
-        if self._updates is None:
+        if self._updates is None or self.fed or self.suboptimal is not None:
             return state
         measurements = state.measurements
         if measurements.find(t) is None:
@@ -510,7 +569,7 @@ class MHE:
         (start, _), growing = self._span(state, end)
         anchor = self._prior(state, start, growing)
         weight = {"prior_factor": anchor.factor, "prior_weight": anchor.weight}
-        records = self._records(state, end, start)
+        records = self.records(state, start, end)
         window = self.assembly.window(start, end, records, anchor.value, growing=growing, **weight)
         return window, anchor.notes if window.L_y.any() else (*anchor.notes, "no measurement in window")
 
@@ -544,18 +603,37 @@ class MHE:
         factor = float(np.exp(-gap * (self.assembly.prior_rate + 1.0 / self.horizon)))
         return Anchor(np.concatenate([x, state.p]), ("prior predicted, uncertified",), factor)
 
-    def _records(self, state: State, end: float, start: float) -> Records:
+    def records(self, state: State, start: float, end: float) -> Records:
+        """Return the measurements and inputs that `state` knows, as far as they matter on [start, end] (seconds)."""
         y_times, y = state.measurements.arrays(end + self.slack(end))
-        return Records(y_times, y, *self._known_inputs(state, start, end))
+        return Records(y_times, y, *self._known_inputs(state, start, end, fed_until=np.inf))
 
-    def _known_inputs(self, state: State, start: float, end: float) -> tuple[Array, Array]:
-        """Return the inputs that matter on [start, end]: for linear hold also the first one behind it, if known."""
+    def _known_inputs(
+        self, state: State, start: float, end: float, *, fed_until: float | None = None
+    ) -> tuple[Array, Array]:
+        """Return the inputs that matter on [start, end]: for linear hold also the first one behind it, if known.
+
+        An observer is fed with measurements until `fed_until`, `start` when left out: a prediction has none.
+        """
         times, rows = state.inputs.arrays(end, beyond=int(self.assembly.input_linear))
-        if len(self.model.u) and (not len(times) or times[0] > start + self.slack(start)):
+        if len(self.controls) and (not len(times) or times[0] > start + self.slack(start)):
             raise InputError(
-                f"no input is known at t = {start:g} s for {', '.join(self.model.u.names)}; give "
+                f"no input is known at t = {start:g} s for {', '.join(self.controls.names)}; give "
                 f"control(state, Input(t={start:g}, u=...)) first"
             )
+        if self.fed:
+            return self.fed_inputs(state, start, end, until=start if fed_until is None else fed_until)
+        return times, rows
+
+    def fed_inputs(self, state: State, start: float, end: float, *, until: float = np.inf) -> tuple[Array, Array]:
+        """Return times and rows of an `observer_model`'s inputs: the known ones, and what was measured `until` then."""
+        inputs = state.inputs.arrays(end)
+        slack, step = self.slack(end), self.model.step
+        measured = state.measurements.arrays(min(end, until) + slack)
+        limit, until = (self.hold_limit, until) if step is None else (step, np.inf)
+        times, rows = fed_inputs(inputs, measured, limit, until)
+        if not len(times) or times[0] > start + slack:
+            times, rows = np.append(start, times), np.vstack([np.zeros((1, rows.shape[1])), rows])
         return times, rows
 
     def _packed(self, window: Window, solution: Solution) -> Solved:
@@ -578,8 +656,13 @@ class MHE:
         cost: float,
         status: Status,
         began: float,
+        given: WindowStart | None = None,
+        observed: float = np.inf,
     ) -> tuple[State, Estimate]:
-        """Return the next state and the estimate of a solved window; `added` is what it adds to the path."""
+        """Return the next state and the estimate of a solved window; `added` is what it adds to the path.
+
+        `given` is what is known of the prior of a suboptimal estimator, whose observer began at `observed`.
+        """
         if self._check is not None and status.success:
             check(self._window(state, t)[0], solved, cost, self._check)
         x, p, w, y = solved.last()
@@ -611,14 +694,16 @@ class MHE:
             track = self.guaranteed.resume(state.track, state.t0, state.start[: self.stage.nx], state.t)
             outside = () if track is state.track else self.guaranteed.outside(state.p)
             known = (*state.doubts, *((np.inf, reason) for reason in outside))
-            doubts = self.guaranteed.current(known, times, first)
+            doubts = self.guaranteed.current(known, times, min(first, observed))
             reasons = [reason for _, reason in doubts] or self.guaranteed.lacking(times, rows, first, t)
-            fields["track"], bound = self.guaranteed.after(track, first, t, cost, status, reasons)
-            fields["doubts"] = self.guaranteed.current(known, times, edge - slack)
+            fields["track"], bound = self.guaranteed.after(track, first, t, cost, status, reasons, given)
+            fields["doubts"] = self.guaranteed.current(known, times, edge - self.prior.reach - slack)
         new = made(State, state.__dict__ | fields)
         memory = self.prior.after(self, new, solved)
         if memory is not new.memory:
             new = made(State, new.__dict__ | {"memory": memory})
+        if self.suboptimal is not None and bound is not None:
+            new = made(State, new.__dict__ | {"memory": self.suboptimal.bounded(self, new, bound)})
 
         def covariance() -> tuple[Array, int]:
             window, _ = self._window(state, t)
