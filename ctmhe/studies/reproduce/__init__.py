@@ -15,9 +15,13 @@ from ctmhe.studies.reproduce import (
     thesis_3_4_2_certificate,
     thesis_4_3_3_horizons,
     thesis_5_2_4_horizon,
+    thesis_fig_4_3,
     thesis_printed_certificates,
     thesis_table_3_2,
     thesis_table_4_2,
+    thesis_table_4_3,
+    thesis_table_4_4,
+    thesis_table_4_5,
 )
 
 CASES: dict[str, Callable[..., dict[str, Any]]] = {
@@ -25,6 +29,11 @@ CASES: dict[str, Callable[..., dict[str, Any]]] = {
     "thesis-3.4.1-certificate": thesis_3_4_1_certificate.reproduce,
     "thesis-table-3.2": thesis_table_3_2.reproduce,
     "thesis-table-4.2": thesis_table_4_2.reproduce,
+    "thesis-table-4.3": thesis_table_4_3.reproduce,
+    "thesis-table-4.4": thesis_table_4_4.reproduce,
+    "thesis-table-4.5": thesis_table_4_5.reproduce,
+    "thesis-fig-4.3": thesis_fig_4_3.figure,
+    "thesis-table-4.6": thesis_fig_4_3.table,
     "thesis-4.3.3-horizons": thesis_4_3_3_horizons.reproduce,
     "thesis-5.2.4-horizon": thesis_5_2_4_horizon.reproduce,
     "certified-runs": certified_runs.reproduce,
