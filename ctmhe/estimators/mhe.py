@@ -26,6 +26,7 @@ from ctmhe.estimators.state import State, load_state, save_state
 from ctmhe.estimators.suboptimal import Suboptimal
 from ctmhe.estimators.trajectories import empty_path, path_at, path_rows, trajectory_at
 from ctmhe.models.continuous import Model
+from ctmhe.models.observer import known_inputs
 from ctmhe.models.signals import Signals
 from ctmhe.solvers.base import Solution, Solver
 from ctmhe.solvers.compiled import compiled_solver
@@ -175,8 +176,8 @@ class MHE:
         self.model, self.clock = model, clock
         if not isinstance(model, Model):
             raise InputError(f"model must be a ContinuousModel, DiscreteModel or FmuModel, got {type(model).__name__}")
-        own: Signals | None = getattr(model, "controls", None)
-        self.fed, self.controls = own is not None, model.u if own is None else own
+        self.controls = known_inputs(model)
+        self.fed = self.controls is not model.u  # an observer, fed with the measurements
         if bounds is not None and not isinstance(bounds, Bounds):
             raise InputError(f"bounds must be a Bounds(x=..., w=..., p=..., y=..., residual=...), got {bounds!r}")
         self.suboptimal = prior if isinstance(prior, Suboptimal) else None

@@ -2,6 +2,7 @@
 
 from ctmhe.models.continuous import ContinuousModel, Model
 from ctmhe.models.discrete import DiscreteModel
+from ctmhe.models.observer import observer_model
 from ctmhe.models.signals import Signals
 
-__all__ = ["ContinuousModel", "DiscreteModel", "Model", "Signals"]
+__all__ = ["ContinuousModel", "DiscreteModel", "Model", "Signals", "observer_model"]

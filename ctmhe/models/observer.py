@@ -10,6 +10,7 @@ import numpy as np
 from ctmhe.errors import InputError
 from ctmhe.models.continuous import ContinuousModel, Model
 from ctmhe.models.discrete import DiscreteModel
+from ctmhe.models.signals import Signals
 from ctmhe.types import Array, Bounds
 
 
@@ -64,6 +65,12 @@ def observer_model(model: Model, K: Any) -> ContinuousModel:
     made = ContinuousModel(f, h, **signals) if model.step is None else DiscreteModel(f, h, step=model.step, **signals)
     made.controls = model.u
     return made
+
+
+def known_inputs(model: Model) -> Signals:
+    """Return the inputs that are given to an estimator: all of them, but for the measurements that feed an observer."""
+    own: Signals | None = getattr(model, "controls", None)
+    return model.u if own is None else own
 
 
 def gain(model: Model, K: Any) -> Array:

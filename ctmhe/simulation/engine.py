@@ -12,6 +12,7 @@ import numpy as np
 
 from ctmhe.errors import CtmheError, FmuUnsupportedError, InputError, TriggerError
 from ctmhe.estimators.mhe import MHE
+from ctmhe.models.observer import known_inputs
 from ctmhe.models.signals import Signals
 from ctmhe.simulation.channel import Channel, Delivery, Everything, WholeSignal, check_hold
 from ctmhe.simulation.drivers import Driver
@@ -102,7 +103,7 @@ class Loop:
         if self.model.step is None:
             check_hold(channel, mhe.hold, self.model.y.names)
         self.y_map = matched(self.model.y, plant.y, "plant", plant.name)
-        self.u_map = matched(self.model.u, plant.u, "plant", plant.name)
+        self.u_map = matched(known_inputs(self.model), plant.u, "plant", plant.name)
         self.channel, self.link = channel, channel.open(seed, self.model.y.names)
         self.sample_time = sample_time
         step = channel.interval(monitor)
@@ -274,7 +275,7 @@ class Loop:
     def _tell(self, u: Array) -> None:
         """Tell the estimators an input that changed."""
         now = self.now
-        if len(self.model.u) and (now.told is None or not np.array_equal(u, now.told)):
+        if len(self.u_map) and (now.told is None or not np.array_equal(u, now.told)):
             for follower in self.followers:
                 follower.tell(Input(now.t, u[self.u_map]))
             now.told = np.array(u)

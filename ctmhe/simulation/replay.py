@@ -12,6 +12,7 @@ from ctmhe.estimators.mhe import MHE
 from ctmhe.models.continuous import Model
 from ctmhe.models.fmu import FmuModel
 from ctmhe.models.fmu.units import conversion, instruction, known_unit
+from ctmhe.models.observer import known_inputs
 from ctmhe.models.signals import Signals
 from ctmhe.simulation.channel import Channel, SingleSample, WholeSignal
 from ctmhe.simulation.engine import Loop
@@ -139,8 +140,8 @@ def replay(
         raise InputError(f"replay: the log has {len(times)} rows between {low:g} and {high:g} s; at least 2 are needed")
     model = mhe.model
     check_units(log, model)
-    plant = RecordedPlant(log, model.y, model.u)
-    columns = [log.inputs.index(name) for name in model.u]
+    plant = RecordedPlant(log, model.y, known_inputs(model))
+    columns = [log.inputs.index(name) for name in known_inputs(model)]
     if channel is None:
         channel = SingleSample() if set(mhe.hold.values()) == {"point"} and model.step is None else WholeSignal()
     loop = Loop(
@@ -166,7 +167,7 @@ def check_units(log: MeasurementLog, model: Model) -> None:
     not checked.
     """
     stated, units = log.units or {}, model.description.units if isinstance(model, FmuModel) else {}
-    for signals in (model.y, model.u):
+    for signals in (model.y, known_inputs(model)):
         for name, unit in zip(signals.names, signals.units, strict=True):
             given = stated.get(name)
             if not given or not unit:
