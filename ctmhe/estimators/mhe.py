@@ -497,7 +497,6 @@ class MHE:
         if status.outcome is Outcome.PREDICTED:
             solution = open_loop(self.stage, state, window)
         given = None if self.guaranteed is None else rule.known(self, state, window, run, candidate, kept)
-        state = made(State, state.__dict__ | {"memory": rule.advanced(self, state, t)})
         solved, status = self._packed(window, solution), self._told(status, failures)
         added = path_rows(solved.trajectory, since)
         return self._conclude(state, t, since, solved, added, solution.cost, status, began, given, run.since)
@@ -700,7 +699,8 @@ class MHE:
             fields["track"], bound = self.guaranteed.after(track, first, t, cost, status, reasons, given)
             fields["doubts"] = self.guaranteed.current(known, times, edge - self.prior.reach - slack)
         new = made(State, state.__dict__ | fields)
-        memory = self.prior.after(self, new, solved)
+        # the prior may look at data that no window needs any more
+        memory = self.prior.after(self, new.knowing(state.measurements, inputs), solved)
         if memory is not new.memory:
             new = made(State, new.__dict__ | {"memory": memory})
         if self.suboptimal is not None and bound is not None:

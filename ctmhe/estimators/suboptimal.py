@@ -127,29 +127,25 @@ class Suboptimal:
         return Anchor(np.concatenate([self.bound(mhe).projected(run.before[-1]), state.p]), run.notes)
 
     def after(self, mhe: MHE, state: State, solved: Solved) -> Memory:
-        """Return the memory with the new estimate, for the observer to start anew from; see `advanced`."""
-        log, slack = state.memory["observer"], mhe.slack(state.t)
-        if not np.isfinite(self.horizon) or state.t <= state.t0 + slack:
-            return state.memory
+        """Return the estimates of the last T seconds, and before them the observer as far as it has got.
+
+        An observer that is initialised once has got to the window's start.
+        """
+        bound, anew, slack = self.bound(mhe), np.isfinite(self.horizon), mhe.slack(state.t)
+        edge = max(state.t - (self.horizon if anew else mhe.horizon), state.t0)
+        log = state.memory["observer"]
+        times, rows = log.arrays()
+        if times[0] < edge - slack:
+            run = self._until(mhe, state, edge, edge)
+            lacking = bound.lacking(mhe, state, run.since, edge)
+            bounded = bound.bounds.passed(run.bounded, edge - run.since, run.before, lacking)
+            later = times > edge + slack
+            rows = np.vstack([np.append(run.before[-1], bounded), rows[later]])
+            log = Log.of(np.append(edge, times[later]), rows, rows.shape[1])
+        if not anew or state.t <= state.t0 + slack:
+            return {"observer": log}
         log = log.drop_after(state.t - slack)  # one that is repeated takes its own place
         return {"observer": log.put(state.t, np.append(state.x, UNKNOWN))}
-
-    def advanced(self, mhe: MHE, state: State, t: float) -> Memory:
-        """Return the memory at `t`, while all data are there: the observer as far as it has got, T before `t`.
-
-        Of an observer that is initialised once, as far as the window's start. Behind it, the estimates since then.
-        """
-        bound, anew, slack = self.bound(mhe), np.isfinite(self.horizon), mhe.slack(t)
-        edge = max(t - (self.horizon if anew else mhe.horizon), state.t0)
-        times, rows = state.memory["observer"].arrays(np.inf)
-        if times[0] >= edge - slack:
-            return state.memory
-        run = self._until(mhe, state, edge, edge)
-        lacking = bound.lacking(mhe, state, run.since, edge)
-        bounded = bound.bounds.passed(run.bounded, edge - run.since, run.before, lacking)
-        later = times > edge + slack
-        rows = np.vstack([np.append(run.before[-1], bounded), rows[later]])
-        return {"observer": Log.of(np.append(edge, times[later]), rows, rows.shape[1])}
 
     def bounded(self, mhe: MHE, state: State, bound: ErrorBound) -> Memory:
         """Return the memory that also knows the bound of the estimate just made."""
@@ -162,7 +158,7 @@ class Suboptimal:
 
     def revised(self, memory: Memory, since: float) -> Memory:
         """Return the memory whose bounds do not rest on what was solved with other data at `since` and later."""
-        times, rows = memory["observer"].arrays(np.inf)
+        times, rows = memory["observer"].arrays()
         rows = rows.copy()
         rows[times >= since, -2:] = np.inf
         return {"observer": Log.of(times, rows, rows.shape[1])}
@@ -230,7 +226,7 @@ class Suboptimal:
 
     def _run_until(self, mhe: MHE, state: State, log: Log, t: float, latest: float) -> Simulated:
         bound, slack, nx = self.bound(mhe), mhe.slack(t), mhe.stage.nx
-        times, rows = log.arrays(np.inf)
+        times, rows = log.arrays()
         k = max(int(np.searchsorted(times, latest + slack, side="right")) - 1, 0)
         since, z, bounded = float(times[k]), rows[k, :nx], Bounded(*rows[k, nx:])
         if t <= since + slack:

@@ -56,7 +56,7 @@ def size(errors: Array) -> Array:
     return np.sqrt(np.einsum("ki,ij,kj->k", errors, REACTOR.P, errors))
 
 
-def figure(*, seeds: int = 100, workers: int = 1, progress: bool = False) -> dict[str, Any]:
+def figure(*, seeds: int = 50, workers: int = 1, progress: bool = False) -> dict[str, Any]:
     """Run Fig. 4.3.
 
     Returns
@@ -90,7 +90,7 @@ def figure(*, seeds: int = 100, workers: int = 1, progress: bool = False) -> dic
     }
 
 
-def table(*, seeds: int = 100, workers: int = 1, progress: bool = False) -> dict[str, Any]:
+def table(*, seeds: int = 50, workers: int = 1, progress: bool = False) -> dict[str, Any]:
     """Run Table 4.6; times are those of this machine, and fair only with one worker.
 
     Returns

@@ -42,7 +42,7 @@ def benchmark() -> MHE:
     return MHE(reactor_discrete(), horizon=BENCHMARK * 0.1, cost=cost, bounds=bounds, filtering=True)
 
 
-def reproduce(*, seeds: int = 50, workers: int = 1, progress: bool = False) -> dict[str, Any]:
+def reproduce(*, seeds: int = 20, workers: int = 1, progress: bool = False) -> dict[str, Any]:
     """Run the case; see `thesis_table_4_3`.
 
     Returns
