@@ -55,7 +55,10 @@ class Prior(Protocol):
     `reach` is for how many seconds before the horizon it needs measurements and inputs.
     """
 
-    reach: float
+    @property
+    def reach(self) -> float:
+        """Seconds."""
+        ...
 
     def begin(self, mhe: MHE, state: State) -> Memory:
         """Return what is remembered at the start of estimation."""

@@ -20,6 +20,7 @@ from ctmhe.studies.reproduce.suboptimal_runs import (
 from ctmhe.types import Bounds
 
 SCALES = {"a = 1e2": 1e2, "a = 1": 1.0, "a = 1e-3": 1e-3, "a = 1e-4": 1e-4}
+PRINTED_HORIZONS = (16, 45, 128, 155)
 LIMITS, BENCHMARK, NOISE, DOUBLED = (0, 1, 2, 3, None), 30, 1e-3, 2.0
 TABLE = (
     (0, 42.90, 2.30, 42.90, 2.50, 42.90, 2.86, 42.85, 2.97),
@@ -77,7 +78,7 @@ def reproduce(*, seeds: int = 20, workers: int = 1, progress: bool = False) -> d
     return {
         "case": "thesis-table-4.5",
         "published": {
-            "N_min": dict(zip(SCALES, (16, 45, 128, 155), strict=True)),
+            "N_min": dict(zip(SCALES, PRINTED_HORIZONS, strict=True)),
             "table": rows_of(("i",), TABLE, dict.fromkeys(SCALES, ("SSE", "tau_avg"))),
             "benchmark": {"SSE": 0.5, "tau_avg": 10.86},
         },
