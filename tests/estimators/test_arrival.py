@@ -70,8 +70,12 @@ def test_the_weight_is_the_inverse_of_the_kalman_filters_covariance():
 def test_in_continuous_time_too():
     """With single samples and a linear model, estimates at cell edges are those of full information."""
     model = ContinuousModel(
-        lambda t, x, u, w, p: (x[1] + w[0], -x[0] + w[1]), lambda t, x, u, w, p: [x[0]], x=("s", "v"), w=("d1", "d2"), y="y"
-    )  # fmt: skip
+        lambda t, x, u, w, p: (x[1] + w[0], -x[0] + w[1]),
+        lambda t, x, u, w, p: [x[0]],
+        x=("s", "v"),
+        w=("d1", "d2"),
+        y="y",
+    )
     cost = DiscountedCost(P=P0, Q=[3.0, 5.0], R=R, rate=0.1)
     times, values = np.arange(1, 25) * 0.25, np.random.default_rng(1).normal(size=24)
     options = {"interval": 0.25, "integrator": RK4(0.125), "cost": cost, "hold": "point"}

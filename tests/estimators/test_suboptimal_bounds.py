@@ -151,6 +151,33 @@ def test_no_bound_without_a_certified_observer():
     assert estimate.bound.theorem is None
 
 
+def test_doubts_outlast_the_window():
+    """An observer that is initialised once never forgets doubtful data: no theorem after them, and a wide bound."""
+    mhe = estimator("system", np.inf, 1)
+    state = mhe.init(x=GUESS)
+    for k in range(20):
+        if k == 6:
+            state = mhe.doubt(state, 5 * STEP, "a message was altered")
+        state, estimate = mhe.estimate(state, k * STEP)
+        state = mhe.observe(state, Measurement(k * STEP, [0.65]))
+        assert estimate.bound is not None and (estimate.bound.theorem is None) is (k >= 6)
+    anew = estimator("system", 5 * STEP, 1)
+    wide = anew.estimate(state, 20 * STEP)[1].bound.level  # another rule goes on, without what this one knew
+    assert wide > 1e2 * estimator("system", np.inf, 1).estimate(mhe.init(x=GUESS), 0.0)[1].bound.level
+
+
+def test_states_of_other_estimators_can_be_continued():
+    """From a filtering prior, and from another observer: estimates go on, bounds begin at the domain's width."""
+    plain = MHE(three_species_discrete(), horizon=N * STEP, cost=DiscountedCost(P=1.0, Q=200.0, R=50.0), bounds=BOX)
+    state = plain.init(x=GUESS)
+    for k in range(8):
+        state, _ = plain.estimate(state, k * STEP)
+        state = plain.observe(state, Measurement(k * STEP, [0.65]))
+    mhe = estimator("observer", np.inf, 1)
+    state, estimate = mhe.estimate(state, 8 * STEP)
+    assert np.isfinite(estimate.x).all() and estimate.bound.theorem is None
+
+
 def test_the_horizon_condition_is_that_of_the_certificates():
     """The theorem is given exactly from T_min of (4.44) on."""
     U, watch = certificate(), observer()

