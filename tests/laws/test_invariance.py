@@ -256,7 +256,7 @@ def test_the_truth_never_costs_less_than_the_estimate(rng):
         start = max(0.0, round(t - 0.5, 10))
         anchor = mhe._prior(state, max(0.0, t - 0.5), t <= 0.5)
         window = mhe.assembly.window(
-            start, t, mhe._records(state, t, start), anchor.value, growing=t <= 0.5, prior_factor=anchor.factor
+            start, t, mhe.records(state, start, t), anchor.value, growing=t <= 0.5, prior_factor=anchor.factor
         )
         true_w = w[window.mesh.cell]
         point = rollout(mhe.stage, window, truth[start], np.empty(0), true_w)

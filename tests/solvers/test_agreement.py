@@ -110,7 +110,7 @@ def test_multipliers_have_the_sign_of_their_bound(rng):
     state = mhe.init(x=guess)
     for k, row in enumerate(rows):
         state = mhe.observe(state, Measurement(k * 0.05, row))
-    window = mhe.assembly.window(0.0, 1.0, mhe._records(state, 1.0, 0.0), np.asarray(guess, float), growing=True)
+    window = mhe.assembly.window(0.0, 1.0, mhe.records(state, 0.0, 1.0), np.asarray(guess, float), growing=True)
     start = shifted_guess(mhe.stage, window)
     ours, reference = mhe._gauss_newton.solve(window, start), mhe._reference.solve(window, start)
     z = ours.multipliers.x

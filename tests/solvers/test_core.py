@@ -67,7 +67,7 @@ def window_of(mhe: MHE, state, end: float) -> tuple[Window, Guess]:
     """The window that `estimate` would solve, and its last guess."""
     anchor = mhe._prior(state, max(end - mhe.horizon, 0.0), end <= mhe.horizon)
     start = max(end - mhe.horizon, 0.0)
-    records = mhe._records(state, end, start)
+    records = mhe.records(state, start, end)
     window = mhe.assembly.window(start, end, records, anchor.value, growing=end <= mhe.horizon)
     return window, shifted_guess(mhe.stage, window)
 

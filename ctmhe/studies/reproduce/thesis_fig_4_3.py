@@ -132,7 +132,7 @@ FIGURE = (
     "s-MHE_2 is as good as the benchmark. f-MHE_2 has no prior, so that the wrong initial estimate costs it nothing."
 )
 TIMES = (
-    "The orders do not come out: what guards an iterate (observer, candidate, decrease condition) and the arrival cost run "
-    "in Python, and cost more than all iterations of the benchmark and of f-MHE_2, which run in the compiled core. Times "
-    "depend on what else the machine does."
+    "The orders do not come out: what guards an iterate (observer, candidate, decrease condition) and the arrival cost "
+    "run in Python, and cost more than all iterations of the benchmark and of f-MHE_2, which run in the compiled core. "
+    "Times depend on what else the machine does."
 )
