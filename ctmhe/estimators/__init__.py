@@ -1,53 +1,19 @@
 """Estimators on explicit state."""
 
-from ctmhe.estimators.arrival import (
-    ArrivalUpdate,
-)
-from ctmhe.estimators.base import (
-    Estimator,
-)
-from ctmhe.estimators.filter import (
-    Filter,
-)
-from ctmhe.estimators.filter_state import (
-    FilterState,
-)
-from ctmhe.estimators.kalman import (
-    Extended,
-    Kalman,
-)
-from ctmhe.estimators.kalman_weight import (
-    KalmanWeight,
-)
-from ctmhe.estimators.luenberger import (
-    Luenberger,
-)
-from ctmhe.estimators.mhe import (
-    MHE,
-    Prediction,
-)
-from ctmhe.estimators.offline import (
-    OfflineEstimate,
-    estimate_offline,
-)
-from ctmhe.estimators.polytopic import (
-    AdaptiveArrival,
-    dual_iterations,
-    polytopic_horizon,
-)
-from ctmhe.estimators.robust_kalman import (
-    RobustKalman,
-    norm_bounded,
-)
-from ctmhe.estimators.state import (
-    State,
-)
-from ctmhe.estimators.suboptimal import (
-    Suboptimal,
-)
-from ctmhe.estimators.unscented import (
-    Unscented,
-)
+from ctmhe.estimators.arrival import ArrivalUpdate
+from ctmhe.estimators.base import Estimator
+from ctmhe.estimators.filter import Filter
+from ctmhe.estimators.filter_state import FilterState
+from ctmhe.estimators.kalman import Extended, Kalman
+from ctmhe.estimators.kalman_weight import KalmanWeight
+from ctmhe.estimators.luenberger import Luenberger
+from ctmhe.estimators.mhe import MHE, Prediction
+from ctmhe.estimators.offline import OfflineEstimate, estimate_offline
+from ctmhe.estimators.polytopic import AdaptiveArrival, dual_iterations, polytopic_horizon
+from ctmhe.estimators.robust_kalman import RobustKalman, norm_bounded
+from ctmhe.estimators.state import State
+from ctmhe.estimators.suboptimal import Suboptimal
+from ctmhe.estimators.unscented import Unscented
 
 __all__ = [
     "MHE",

@@ -247,11 +247,11 @@ class MHE:
         )
         self.guaranteed = None if guarantee is None else Guaranteed(guarantee, self)
         limits: dict[str, Any] = {"max_iterations": max_iterations or 100, "deadline": deadline, "clock": clock}
-        limited = {"max_iterations": max_iterations} if max_iterations and self.suboptimal is not None else {}
+        limited = max_iterations or None if self.suboptimal is not None else None
         if tolerance is not None:
             limits["tolerance"] = positive("tolerance", tolerance)
         self._gauss_newton = GaussNewton(self.stage, **limits)
-        self._reference = Ipopt(self.stage, **limited)
+        self._reference = Ipopt(self.stage, max_iterations=limited)
         # how often a model that is not ours (an FMU) could not be evaluated, and the last time in words
         self._failures: Callable[[], tuple[int, str]] | None = getattr(model, "failures", None)
         compile = compile or os.environ.get("CTMHE_COMPILE") or "auto"
@@ -529,7 +529,6 @@ class MHE:
         if status.outcome is Outcome.PREDICTED:
             solution = open_loop(self.stage, state, window)
         given = None if self.guaranteed is None else rule.known(self, state, window, run, candidate, kept)
-        state = made(State, state.__dict__ | {"memory": rule.advanced(self, state, t)})
         solved, status = self._packed(window, solution), self._told(status, failures)
         added = path_rows(solved.trajectory, since)
         return self._conclude(state, t, since, solved, added, solution.cost, status, began, given, run.since)
@@ -737,7 +736,7 @@ class MHE:
             "solves": state.solves + 1,
             "prepared": None,
         }
-        bound = None
+        bound, known = None, state.doubts
         if self.guaranteed is not None:
             first = float(solved.part("t")[0])
             times, rows = state.measurements.arrays(t + self.slack(t))
@@ -749,7 +748,9 @@ class MHE:
             fields["track"], bound = self.guaranteed.after(track, first, t, cost, status, reasons, given)
             fields["doubts"] = self.guaranteed.current(known, times, edge - self.prior.reach - slack)
         new = made(State, state.__dict__ | fields)
-        memory = self.prior.after(self, new, solved)
+        # the prior may look at data that no window needs any more, and at what is doubtful about them
+        passing = {"measurements": state.measurements, "inputs": inputs, "doubts": known}
+        memory = self.prior.after(self, made(State, new.__dict__ | passing), solved)
         if memory is not new.memory:
             new = made(State, new.__dict__ | {"memory": memory})
         if self.suboptimal is not None and bound is not None:

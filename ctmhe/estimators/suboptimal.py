@@ -116,7 +116,8 @@ class Suboptimal:
     def begin(self, mhe: MHE, state: State) -> Memory:
         """Return the observer at the start: it begins at the initial estimate."""
         bound, x = self.bound(mhe), state.start[: mhe.stage.nx]
-        return {"observer": Log(len(x) + 2).put(state.t0, np.append(x, bound.bounds.initial(mhe, x)))}
+        first = Log(len(x) + 2).put(state.t0, np.append(x, bound.bounds.initial(mhe, x)))
+        return {"observer": first, "key": Log(1).put(state.t0, np.array([bound.bounds.key]))}
 
     def at(self, mhe: MHE, state: State, start: float, growing: bool) -> Anchor | None:
         """Return the observer's state at the window's start, projected onto the bounds: (4.18), (4.57)."""
@@ -127,29 +128,35 @@ class Suboptimal:
         return Anchor(np.concatenate([self.bound(mhe).projected(run.before[-1]), state.p]), run.notes)
 
     def after(self, mhe: MHE, state: State, solved: Solved) -> Memory:
-        """Return the memory with the new estimate, for the observer to start anew from; see `advanced`."""
-        log, slack = state.memory["observer"], mhe.slack(state.t)
-        if not np.isfinite(self.horizon) or state.t <= state.t0 + slack:
-            return state.memory
-        log = log.drop_after(state.t - slack)  # one that is repeated takes its own place
-        return {"observer": log.put(state.t, np.append(state.x, UNKNOWN))}
+        """Return the estimates of the last T seconds, and before them the observer as far as it has got.
 
-    def advanced(self, mhe: MHE, state: State, t: float) -> Memory:
-        """Return the memory at `t`, while all data are there: the observer as far as it has got, T before `t`.
-
-        Of an observer that is initialised once, as far as the window's start. Behind it, the estimates since then.
+        An observer that is initialised once has got to the window's start.
         """
-        bound, anew, slack = self.bound(mhe), np.isfinite(self.horizon), mhe.slack(t)
-        edge = max(t - (self.horizon if anew else mhe.horizon), state.t0)
-        times, rows = state.memory["observer"].arrays(np.inf)
-        if times[0] >= edge - slack:
-            return state.memory
-        run = self._until(mhe, state, edge, edge)
-        lacking = bound.lacking(mhe, state, run.since, edge)
-        bounded = bound.bounds.passed(run.bounded, edge - run.since, run.before, lacking)
-        later = times > edge + slack
-        rows = np.vstack([np.append(run.before[-1], bounded), rows[later]])
-        return {"observer": Log.of(np.append(edge, times[later]), rows, rows.shape[1])}
+        bound, anew, slack = self.bound(mhe), np.isfinite(self.horizon), mhe.slack(state.t)
+        edge = max(state.t - (self.horizon if anew else mhe.horizon), state.t0)
+        log, known = self._log(mhe, state), Log(1).put(state.t0, np.array([bound.bounds.key]))
+        times, rows = log.arrays()
+        if times[0] < edge - slack:
+            run = self._until(mhe, state, edge, edge)
+            lacking = bound.lacking(mhe, state, run.since, edge)
+            bounded = bound.bounds.passed(run.bounded, edge - run.since, run.before, lacking)
+            later = times > edge + slack
+            rows = np.vstack([np.append(run.before[-1], bounded), rows[later]])
+            log = Log.of(np.append(edge, times[later]), rows, rows.shape[1])
+        if not anew or state.t <= state.t0 + slack:
+            return {"observer": log, "key": known}
+        log = log.drop_after(state.t - slack)  # one that is repeated takes its own place
+        return {"observer": log.put(state.t, np.append(state.x, UNKNOWN)), "key": known}
+
+    def _log(self, mhe: MHE, state: State) -> Log:
+        """Return what is remembered; bounds that another observer or another certificate gave are not."""
+        log, key = state.memory.get("observer"), state.memory.get("key")
+        if log is None:  # the state of an estimator with another prior
+            t = max(state.t - mhe.horizon, state.t0)
+            return Log(mhe.stage.nx + 2).put(t, np.append(mhe.trajectory(state, t), UNKNOWN))
+        if key is None or key.arrays()[1][0, 0] != self.bound(mhe).bounds.key:
+            return self.revised(state.memory, -np.inf)["observer"]
+        return log
 
     def bounded(self, mhe: MHE, state: State, bound: ErrorBound) -> Memory:
         """Return the memory that also knows the bound of the estimate just made."""
@@ -158,14 +165,14 @@ class Suboptimal:
         if row is None or state.t == state.t0:
             return state.memory
         row[-2:] = self.bound(mhe).bounds.of(bound)
-        return {"observer": log.put(state.t, row)}
+        return {**state.memory, "observer": log.put(state.t, row)}
 
     def revised(self, memory: Memory, since: float) -> Memory:
         """Return the memory whose bounds do not rest on what was solved with other data at `since` and later."""
-        times, rows = memory["observer"].arrays(np.inf)
+        times, rows = memory["observer"].arrays()
         rows = rows.copy()
         rows[times >= since, -2:] = np.inf
-        return {"observer": Log.of(times, rows, rows.shape[1])}
+        return {**memory, "observer": Log.of(times, rows, rows.shape[1])}
 
     def bound(self, mhe: MHE) -> Bound:
         """Return what belongs to one estimator."""
@@ -220,17 +227,17 @@ class Suboptimal:
 
     def _until(self, mhe: MHE, state: State, t: float, latest: float) -> Simulated:
         """Run the observer to `t` from the last estimate at or before `latest`, or from where it is known."""
-        bound, log = self.bound(mhe), state.memory["observer"]
-        key = (log, state.measurements, state.inputs, state.window, t, latest)
+        bound = self.bound(mhe)
+        key = (state.memory.get("observer"), state.measurements, state.inputs, state.window, t, latest)
         if all(a is b or a == b for a, b in zip(key, bound.last[0], strict=True)):
             return bound.last[1]
-        found = self._run_until(mhe, state, log, t, latest)
+        found = self._run_until(mhe, state, self._log(mhe, state), t, latest)
         bound.last = (key, found)
         return found
 
     def _run_until(self, mhe: MHE, state: State, log: Log, t: float, latest: float) -> Simulated:
         bound, slack, nx = self.bound(mhe), mhe.slack(t), mhe.stage.nx
-        times, rows = log.arrays(np.inf)
+        times, rows = log.arrays()
         k = max(int(np.searchsorted(times, latest + slack, side="right")) - 1, 0)
         since, z, bounded = float(times[k]), rows[k, :nx], Bounded(*rows[k, nx:])
         if t <= since + slack:
@@ -323,10 +330,14 @@ class Bound:
             return x
 
     def lacking(self, mhe: MHE, state: State, start: float, end: float) -> tuple[str, ...]:
-        """Return what is missing of the data that the observer was fed with on [start, end]."""
-        if self.bounds.unmet or mhe.guaranteed is None or end <= start + mhe.slack(end):
+        """Return what is missing, or doubtful, of the data that the observer was fed with on [start, end]."""
+        slack = mhe.slack(end)
+        if self.bounds.unmet or mhe.guaranteed is None or end <= start + slack:
             return ()
-        return mhe.guaranteed.lacking(*state.measurements.arrays(end + mhe.slack(end)), start, end)
+        times, rows = state.measurements.arrays(end + slack)
+        doubts = mhe.guaranteed.current(state.doubts, times, start)
+        found = tuple(reason for when, reason in doubts if when <= end + slack or np.isinf(when))
+        return found or mhe.guaranteed.lacking(times, rows, start, end)
 
 
 def _full_process(model: Model) -> tuple[np.ndarray | None, bool]:

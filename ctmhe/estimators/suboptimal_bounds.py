@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from hashlib import sha256
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -49,6 +50,7 @@ class SuboptimalBounds:
         self.kind, self.horizon = kind, horizon
         self.unmet: tuple[str, ...] = ()
         self._sigmas: dict[tuple[int, bool], float] = {}
+        self.key = 0.0  # tells these bounds from others
         self.observer = observer if isinstance(observer, LuenbergerObserver) else None
         if mhe.guaranteed is None:
             self.unmet = ("no guarantee was asked for",)
@@ -61,13 +63,13 @@ class SuboptimalBounds:
         if self.unmet or mhe.guaranteed is None or self.observer is None:
             return
         model, U = mhe.model, mhe.guaranteed.bounds.certificate
-        V = self.observer.function.scaled(  # Assumption 4.4: without loss of generality
-            max(largest_ratio(U.P_upper, self.observer.function.P_lower) * (1 + 1e-12), 1.0)
-        )
+        watching = self.observer
+        factor = max(largest_ratio(U.P_upper, watching.function.P_lower) * (1 + 1e-12), 1.0)
+        V = watching.function.scaled(factor)  # Assumption 4.4: without loss of generality
         self.function, self.system, self.energy = V, U, mhe.guaranteed.bounds.energy
         sizes = mhe.guaranteed.sizes
         places = [model.w.index(name) for name in (*self.observer.process, *self.observer.noise)]
-        self.supply = largest_square(block_diag(V.Q, V.R), sizes[places])
+        self.supply = largest_square(np.asarray(block_diag(V.Q, V.R)), np.asarray(sizes)[places])
         self.to_system = largest_ratio(U.P_upper, V.P_lower)
         self.to_observer = largest_ratio(V.P_upper, U.P_lower)
         self.unit = model.step or 1.0
@@ -77,6 +79,9 @@ class SuboptimalBounds:
         self.discount, self.filtering = float(mhe.cost.eta or 1.0), mhe.assembly.filtering
         self.cap = mhe.guaranteed.bounds.cap
         self.without_theorem = self._theorem_unmet(mhe)
+        told = (V.P_upper, V.Q, V.R, U.P_lower, U.P_upper, U.Q, np.array([V.eta, U.eta, self.supply]), watching.K)
+        digest = sha256(np.concatenate([np.ravel(part) for part in told]).tobytes()).digest()
+        self.key = float(int.from_bytes(digest[:6], "big"))
 
     def _against(self, observer: LuenbergerObserver, mhe: MHE) -> tuple[str, ...]:
         """Return why the observer's certificate is not about this estimator."""
@@ -155,7 +160,7 @@ class SuboptimalBounds:
 
     def outside(self, x: Array) -> list[str]:
         """Return which states of the observer, z (m, nx), leave its domain."""
-        out = ((x < self.lower) | (x > self.upper)).any(axis=0)
+        out = np.any((x < self.lower) | (x > self.upper), axis=0).tolist()
         return [name for name, left in zip(self.x_names, out, strict=True) if left]
 
     def passed(self, bounded: Bounded, seconds: float, x: Array, lacking: tuple[str, ...]) -> Bounded:

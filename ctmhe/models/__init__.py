@@ -6,4 +6,12 @@ from ctmhe.models.observer import observer_model
 from ctmhe.models.polytope import mixture, polytope
 from ctmhe.models.signals import Signals
 
-__all__ = ["ContinuousModel", "DiscreteModel", "Model", "Signals", "mixture", "observer_model", "polytope"]
+__all__ = [
+    "ContinuousModel",
+    "DiscreteModel",
+    "Model",
+    "Signals",
+    "mixture",
+    "observer_model",
+    "polytope",
+]

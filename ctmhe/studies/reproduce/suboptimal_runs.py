@@ -90,7 +90,7 @@ def averaged(experiment: Experiment, build: Callable[[], MHE], seeds: int, steps
     return {
         "SSE": mean_std([run.sse for run in runs]),
         "J_acc": mean_std([run.costs.sum() / steps for run in runs]),
-        "tau_avg": float(np.mean([run.seconds[steps:].mean() for run in runs]) * 1e3),
+        "tau_avg": float(np.mean([run.seconds[min(steps, experiment.steps) :].mean() for run in runs]) * 1e3),
     }
 
 

@@ -36,7 +36,7 @@ def estimator(name: str, limit: int) -> MHE:
     return species_mhe(candidate, N=N, T=T, i=limit, solver="gauss-newton", filtering=True, start="last")
 
 
-def reproduce(*, seeds: int = 100, workers: int = 1, progress: bool = False) -> dict[str, Any]:
+def reproduce(*, seeds: int = 50, workers: int = 1, progress: bool = False) -> dict[str, Any]:
     """Run the case; see `thesis_table_4_3`.
 
     Returns

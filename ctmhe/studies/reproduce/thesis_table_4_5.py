@@ -20,6 +20,7 @@ from ctmhe.studies.reproduce.suboptimal_runs import (
 from ctmhe.types import Bounds
 
 SCALES = {"a = 1e2": 1e2, "a = 1": 1.0, "a = 1e-3": 1e-3, "a = 1e-4": 1e-4}
+PRINTED_HORIZONS = (16, 45, 128, 155)
 LIMITS, BENCHMARK, NOISE, DOUBLED = (0, 1, 2, 3, None), 30, 1e-3, 2.0
 TABLE = (
     (0, 42.90, 2.30, 42.90, 2.50, 42.90, 2.86, 42.85, 2.97),
@@ -42,7 +43,7 @@ def benchmark() -> MHE:
     return MHE(reactor_discrete(), horizon=BENCHMARK * 0.1, cost=cost, bounds=bounds, filtering=True)
 
 
-def reproduce(*, seeds: int = 50, workers: int = 1, progress: bool = False) -> dict[str, Any]:
+def reproduce(*, seeds: int = 20, workers: int = 1, progress: bool = False) -> dict[str, Any]:
     """Run the case; see `thesis_table_4_3`.
 
     Returns
@@ -77,7 +78,7 @@ def reproduce(*, seeds: int = 50, workers: int = 1, progress: bool = False) -> d
     return {
         "case": "thesis-table-4.5",
         "published": {
-            "N_min": dict(zip(SCALES, (16, 45, 128, 155), strict=True)),
+            "N_min": dict(zip(SCALES, PRINTED_HORIZONS, strict=True)),
             "table": rows_of(("i",), TABLE, dict.fromkeys(SCALES, ("SSE", "tau_avg"))),
             "benchmark": {"SSE": 0.5, "tau_avg": 10.86},
         },
@@ -106,5 +107,6 @@ COMMENT = (
     "Measurement noise up to 1e-3 and twice the stage cost of (4.73) are what gives the published SSE, not the printed "
     "1e-2 and (4.73); `as_printed` has those, for i = 1. Iterations are Gauss-Newton's: IPOPT's 320,000 solves would "
     "take hours here. The orders are as published: only small a improve the observer (i = 0), the first iteration does "
-    "it, and the longer horizon costs little time, as there is nothing but the initial state to decide on."
+    "it. The printed 42.90 of the observer is 44.4 here, with another realisation of the same noise. Times were taken "
+    "while the machine did other things; the benchmark runs wholly in the compiled core, the others do not."
 )
