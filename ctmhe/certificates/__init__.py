@@ -24,6 +24,7 @@ _PLACES = {
         "search_jointly",
         "uniform_excitation",
     ),
+    "joint_bounds": ("JointGuarantee",),
     "metric": ("certify_metric",),
     "joint_horizons": ("joint_conditions", "joint_horizon"),
     "observers": ("design_observer",),

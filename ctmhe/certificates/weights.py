@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +15,7 @@ from ctmhe.certificates.injection import Units, coordinates
 from ctmhe.certificates.lmi import require_cvxpy, solved
 from ctmhe.errors import CertificateError, InputError
 from ctmhe.models.continuous import Model
-from ctmhe.types import Array, Bounds, frozen, positive
+from ctmhe.types import Array, Bounds, DiscountedCost, frozen, positive
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,6 +154,51 @@ class JointWeights:
     def gamma(self, s: Any) -> Any:
         """Return gamma(s) of (5.10), s a number or an array."""
         return self.eta_x**s + self.ratio * self.eta_p**s
+
+    def cost(self, model: Model, **varying: Any) -> DiscountedCost:
+        """Return the cost (5.9), or (5.77) for a model that has its parameters as its last states.
+
+        Its prior fades by gamma and eta_1, its stage by eta_2: per step, or per second in continuous time.
+
+        Parameters
+        ----------
+        model : Model
+            Of the estimator.
+        **varying : callable of time, or matrix
+            W, V, Q or R in place of the constant ones, W and V of the time at which the window starts. Not below the
+            floors (5.13)-(5.16), which `unmet` compares.
+        """
+        unknown = sorted(set(varying) - set("WVQR"))
+        if unknown:
+            raise InputError(f"cost: weights are W, V, Q and R, got {', '.join(unknown)}")
+        given = {name: varying.get(name, getattr(self, name)) for name in "WVQR"}
+        prior = FadingWeight(self, model.step or 1.0, given["W"], given["V"])
+        return DiscountedCost(P=prior, Q=given["Q"], R=given["R"], eta=self.eta_2, prior_eta=1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class FadingWeight:
+    """The prior's weight of (5.9): gamma(N_t) W for the states, eta_1^N_t V for the parameters.
+
+    Attributes
+    ----------
+    weights : JointWeights
+        Whose discounts they are.
+    step : float
+        Seconds in which discounts count.
+    W, V : array, or callable of the window's start in seconds
+    """
+
+    weights: JointWeights
+    step: float
+    W: Array | Callable[[float], Any]
+    V: Array | Callable[[float], Any]
+
+    def __call__(self, start: float, length: float) -> Array:
+        """Return the weight (nx + np, nx + np) for a window of `length` seconds."""
+        n = length / self.step
+        W, V = (np.asarray(part(start) if callable(part) else part) for part in (self.W, self.V))
+        return block_diag(self.weights.gamma(n) * W, self.weights.eta_1**n * V)
 
 
 def joint_weights(
