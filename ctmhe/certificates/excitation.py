@@ -209,26 +209,35 @@ class ExcitationMonitor:
             Y, S = (np.array(part, dtype=float) for part in start)
             if Y.shape != (n, o) or S.shape != (o, o):
                 raise InputError(f"start: expected Y ({n}, {o}) and S ({o}, {o}), got {Y.shape} and {S.shape}")
-        plain = np.zeros((o, o))
         Phi, G, C, F = design.recursion(jacobians)
         if design.discrete:
+            Ys = np.empty((N + 1, n, o))
+            Ys[0] = Y
             for k in range(N):
-                seen = C[k] @ Y + F[k]
-                gain = seen.T @ seen
-                S, plain = design.mu * S + gain, plain + gain
-                Y = Phi[k] @ Y + G[k]
-        elif N:
-            carry, feed, kept = *_half_slots(Phi[:N], h, constant=design.Phi is not None), design.mu**h
+                Ys[k + 1] = Phi[k] @ Ys[k] + G[k]
+            gains = _squares(C @ Ys[:-1] + F)
+            weights, fade, Y = np.ones(N), design.mu ** np.arange(N - 1.0, -1.0, -1.0), Ys[-1]
+            S = design.mu**N * S
+        else:
+            carry, feed = _half_slots(Phi[:N], h, constant=design.Phi is not None) if N else (Phi, Phi)
+            Ys = np.empty((3, N, n, o))  # at starts, middles and ends of slots
             for k in range(N):
-                middle = carry[k] @ Y + feed[k] @ G[N + k]
-                end = carry[k] @ middle + feed[k] @ G[2 * N + k]
-                gains = [seen.T @ seen for seen in (C[k] @ part + F[k] for part in (Y, middle, end))]
-                simpson = h[k] / 6 * np.array([1.0, 4.0, 1.0])
-                faded = simpson * kept[k] ** np.array([1.0, 0.5, 0.0])
-                S = kept[k] * S + sum(weight * gain for weight, gain in zip(faded, gains, strict=True))
-                plain = plain + sum(weight * gain for weight, gain in zip(simpson, gains, strict=True))
-                Y = end
+                Ys[0, k] = Y
+                Ys[1, k] = carry[k] @ Y + feed[k] @ G[N + k]
+                Ys[2, k] = Y = carry[k] @ Ys[1, k] + feed[k] @ G[2 * N + k]
+            gains = _squares(C[:N] @ Ys + F[:N]).reshape(3 * N, o, o)
+            weights = np.outer([1 / 6, 4 / 6, 1 / 6], h).ravel()  # Simpson's rule
+            behind = np.append(np.cumsum(h[::-1])[-2::-1], 0.0) if N else h  # from a slot's end to the last one's
+            fade = design.mu ** (behind + np.outer([1.0, 0.5, 0.0], h)).ravel()
+            S = design.mu ** h.sum() * S
+        S = S + np.einsum("k,kij->ij", weights * fade, gains)
+        plain = np.einsum("k,kij->ij", weights, gains)
         return Information(frozen(S), frozen(plain), frozen(Y), model.p.names, frozen(model.p.nominal))
+
+
+def _squares(seen: Array) -> Array:
+    """Return v'v of matrices v (..., ny, np)."""
+    return np.swapaxes(seen, -1, -2) @ seen
 
 
 def _half_slots(Phi: Array, h: Array, *, constant: bool) -> tuple[Array, Array]:

@@ -83,6 +83,10 @@ class JointCertificate:
         kappa : float, optional
             Of (33); the certificate's own when left out.
         """
+        return self.window(trajectory, kappa=kappa)[1]
+
+    def window(self, trajectory: Trajectory, *, kappa: float | None = None) -> tuple[Array, OnlineConditions]:
+        """Return M at the end of an estimated window (nx + np, nx + np), and what `check` returns."""
         if self.design.scope != "global":
             raise CertificateError(
                 "check: conditions (33)-(34) say something of the true trajectory only where one trajectory gives the "
@@ -97,7 +101,7 @@ class JointCertificate:
         nominal = Units.of(self.design.model).p
         alpha = float(np.linalg.eigvalsh(nominal @ found.undiscounted @ nominal)[0])
         limit = self.kappa if kappa is None else positive("check: kappa", kappa)
-        return OnlineConditions(largest, limit, alpha, self.alpha, self.rho(T, largest))
+        return M, OnlineConditions(largest, limit, alpha, self.alpha, self.rho(T, largest))
 
 
 @dataclass(frozen=True)

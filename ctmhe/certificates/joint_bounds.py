@@ -6,10 +6,11 @@ Definition 5.1 say ::
     U(N)     <= eta_x^N |dx(0)|^2_P_upper + sum of eta_x^(N-1-j) ( |dp|^2_S_x + |dw|^2_Q_x + |dy|^2_R_x )
     |dp|^2_S <= eta_p^N |dx(0)|^2_P_p     + sum of eta_p^(N-1-j) ( |dw|^2_Q_p + |dy|^2_R_p )     where excited
 
-The right sides hold dx(0) = (x*(0) - x_bar) + (x_bar - x(0)) and dw = w* - w, whose first parts are known when the window
-is solved and whose second ones are bounded, by what the window that gave x_bar said and by the largest disturbance. So
-they bound the error of any trajectory of the model, whatever cost it came from: the *level*. The lemmas bound the known
-parts too, by what the truth would cost: the *theorem*, which needs the weights of (5.9) to be those of Assumption 5.2.
+The right sides hold dx(0) = (x*(0) - x_bar) + (x_bar - x(0)) and dw = w* - w, whose first parts are known when the
+window is solved and whose second ones are bounded, by what the window that gave x_bar said and by the largest
+disturbance. So they bound the error of any trajectory of the model, whatever cost it came from: the *level*. The lemmas
+bound the known parts too, by what the truth would cost: the *theorem*, which needs the weights of (5.9) to be those of
+Assumption 5.2.
 """
 
 from __future__ import annotations
@@ -132,49 +133,63 @@ class JointBounds:
         weights, excited = self.guarantee.weights, self.guarantee.excited
         return joint_conditions(weights, self.states, excited, horizon=self.horizon)
 
+    @cached_property
+    def _ratios(self) -> dict[str, float]:
+        weights, states, excited = self.guarantee.weights, self.states, self.guarantee.excited
+        pairs = {
+            "P P_lower": (states.P_upper, states.P_lower), "P_p P_lower": (excited.P, states.P_lower),
+            "P_p P": (excited.P, states.P_upper), "S_x S": (states.S, excited.S), "S_x V": (states.S, weights.V / 2),
+            "V S": (weights.V, excited.S), "S V": (excited.S, weights.V), "W P_lower": (weights.W, states.P_lower),
+            "W P": (weights.W, states.P_upper),
+        }  # fmt: skip
+        return {name: largest_ratio(*pair) for name, pair in pairs.items()}
+
+    @cached_property
+    def _supplies(self) -> dict[str, float]:
+        weights = {"x": self.states.Q, "p": self.guarantee.excited.Q, "cost": self.guarantee.weights.Q}
+        return {name: largest_square(Q, self.sizes) for name, Q in weights.items()}
+
     def level(self, before: Errors, told: float, found: Evidence) -> Errors:
         """Return the bounds after a window from what it found; `before` at its start, `told` before the solve."""
-        states, excited, n = self.states, self.guarantee.excited, len(found.w)
-        ratio = 1.0 if found.growing else largest_ratio(states.P_upper, states.P_lower)
+        states, excited, n, ratios = self.states, self.guarantee.excited, len(found.w), self._ratios
+        ratio = 1.0 if found.growing else ratios["P P_lower"]
         start = (square(states.P_upper, found.x) ** 0.5 + (ratio * before.state) ** 0.5) ** 2
         parameters = (square(excited.S, found.p) ** 0.5 + before.prior**0.5) ** 2
         if found.level >= self.alpha:  # E_T is in proportion to the level
-            ratio = largest_ratio(excited.P, states.P_upper if found.growing else states.P_lower)
+            ratio = ratios["P_p P" if found.growing else "P_p P_lower"]
             shown = (square(excited.P, found.x) ** 0.5 + (ratio * before.state) ** 0.5) ** 2
-            seen = excited.eta**n * shown + self._supplied(excited.Q, excited.R, excited.eta, found)
+            seen = excited.eta**n * shown + self._supplied("p", excited, found)
             parameters = min(parameters, self.alpha / found.level * seen)
         parameters = min(parameters, self.cap_p)
-        pushed = largest_ratio(states.S, excited.S) * (1 - states.eta**n) / (1 - states.eta) * parameters
+        pushed = ratios["S_x S"] * (1 - states.eta**n) / (1 - states.eta) * parameters
         end = states.eta**n * min(start, self.cap_x) + pushed
-        end = min(end + self._supplied(states.Q, states.R, states.eta, found), self.cap_x)
+        end = min(end + self._supplied("x", states, found), self.cap_x)
         return self._concluded(before, told, end, parameters, found)
 
     def theorem(self, before: Errors, told: float, found: Evidence) -> Errors:
         """Return the bounds of Lemma 5.2 after an excited full window, of Lemma 5.1 after any other."""
-        weights, states, excited = self.guarantee.weights, self.states, self.guarantee.excited
+        weights, states, ratios = self.guarantee.weights, self.states, self._ratios
         N, n = self.horizon, len(found.w)
-        supply = self._energy(weights.Q, weights.eta_2, n)
-        prior = largest_ratio(weights.V, excited.S) * before.prior
+        supply, prior = self._energy("cost", weights.eta_2, n), ratios["V S"] * before.prior
         if found.level >= self.alpha and n == N:
             met, summed = self.conditions, (1 - states.eta**N) / (1 - states.eta)
-            c_2 = met.c * largest_ratio(weights.V, excited.S) + largest_ratio(states.S, excited.S) * summed
+            c_2 = met.c * ratios["V S"] + ratios["S_x S"] * summed
             end = max(met.excited, met.prior) * (before.state + prior) + 2 * c_2 * supply
-            parameters = largest_ratio(excited.S, weights.V) * end / met.c
+            parameters = ratios["S V"] * end / met.c
         else:
-            c_1 = largest_ratio(states.S, weights.V / 2) * (1 - states.eta**n) / (1 - states.eta) + 2
-            ratio = largest_ratio(weights.W, states.P_upper if found.growing else states.P_lower)
+            c_1 = ratios["S_x V"] * (1 - states.eta**n) / (1 - states.eta) + 2
+            ratio = ratios["W P" if found.growing else "W P_lower"]
             spread = (states.eta**n + weights.gamma(n)) * ratio * before.state
             end = weights.eta_1**-N * c_1 * (spread + 2 * weights.eta_1**n * prior + 2 * supply)
-            parameters = largest_ratio(excited.S, weights.V) * end
+            parameters = ratios["S V"] * end
         return self._concluded(before, told, min(end, self.cap_x), min(parameters, self.cap_p), found)
 
     def most(self, before: Errors, found: Evidence) -> float:
         """Return what the truth can cost at most: the right side of (5.32)."""
-        weights, states, n = self.guarantee.weights, self.states, len(found.w)
-        ratio = largest_ratio(weights.W, states.P_upper if found.growing else states.P_lower)
-        prior = largest_ratio(weights.V, self.guarantee.excited.S) * before.prior
+        weights, ratios, n = self.guarantee.weights, self._ratios, len(found.w)
+        ratio, prior = ratios["W P" if found.growing else "W P_lower"], ratios["V S"] * before.prior
         spread = weights.gamma(n) * ratio * before.state + weights.eta_1**n * prior
-        return spread + self._energy(weights.Q, weights.eta_2, n)
+        return spread + self._energy("cost", weights.eta_2, n)
 
     def cost(self, found: Evidence) -> float:
         """Return the cost (5.9) of what was found."""
@@ -187,13 +202,13 @@ class JointBounds:
         whole = excited and len(found.w) == self.horizon
         return Errors(end, parameters if whole else before.prior, parameters if excited else told)
 
-    def _energy(self, Q: Array, eta: float, n: int) -> float:
-        return largest_square(Q, self.sizes) * (1 - eta**n) / (1 - eta)
+    def _energy(self, name: str, eta: float, n: int) -> float:
+        return self._supplies[name] * (1 - eta**n) / (1 - eta)
 
-    def _supplied(self, Q: Array, R: Array, eta: float, found: Evidence) -> float:
+    def _supplied(self, name: str, part: StateDetectability | ExcitedSet, found: Evidence) -> float:
         """Return a bound of the discounted sum of |dw|^2_Q + |dy|^2_R."""
-        known, unknown = discounted(Q, found.w, eta), self._energy(Q, eta, len(found.w))
-        return (known**0.5 + unknown**0.5) ** 2 + discounted(R, found.y, eta)
+        known, unknown = discounted(part.Q, found.w, part.eta), self._energy(name, part.eta, len(found.w))
+        return (known**0.5 + unknown**0.5) ** 2 + discounted(part.R, found.y, part.eta)
 
 
 def joint_level(joint: JointCertificate, before: float, found: Evidence, sizes: Array) -> tuple[float, float, float]:
@@ -218,4 +233,4 @@ def square(weight: Array, v: Array) -> float:
 def discounted(weight: Array, rows: Array, eta: float) -> float:
     """Return the sum of eta^(N-1-j) |v(j)|^2 over rows (N, n)."""
     fade = eta ** np.arange(len(rows) - 1.0, -1.0, -1.0)
-    return float(fade @ np.einsum("ki,ij,kj->k", rows, weight, rows))
+    return float(fade @ ((rows @ weight) * rows).sum(axis=1))

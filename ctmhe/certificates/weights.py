@@ -198,7 +198,9 @@ class FadingWeight:
         """Return the weight (nx + np, nx + np) for a window of `length` seconds."""
         n = length / self.step
         W, V = (np.asarray(part(start) if callable(part) else part) for part in (self.W, self.V))
-        return block_diag(self.weights.gamma(n) * W, self.weights.eta_1**n * V)
+        nx, both = len(W), np.zeros((len(W) + len(V),) * 2)
+        both[:nx, :nx], both[nx:, nx:] = self.weights.gamma(n) * W, self.weights.eta_1**n * V
+        return both
 
 
 def joint_weights(

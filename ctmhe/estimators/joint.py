@@ -14,7 +14,7 @@ from ctmhe.certificates.excited_set import ExcitationDesign
 from ctmhe.certificates.joint_bounds import Errors, JointGuarantee
 from ctmhe.data.log import Log
 from ctmhe.errors import InputError
-from ctmhe.estimators.joint_evidence import JointLevels, joint_levels
+from ctmhe.estimators.joint_evidence import joint_levels
 from ctmhe.estimators.priors import Anchor, Filtering, Memory, Told
 from ctmhe.models.continuous import Model
 from ctmhe.transcription.solved import Solved
@@ -45,7 +45,8 @@ class Row(NamedTuple):
     @classmethod
     def of(cls, row: Array, k: int) -> Row:
         """Take a row of the log apart."""
-        return cls(row[0], row[1], *row[2 : 2 + 3 * k].reshape(3, k), row[2 + 3 * k :])
+        prior, told, seen = row[2 : 2 + 3 * k].reshape(3, k)
+        return cls(row[0], row[1], prior, told, seen, row[2 + 3 * k :])
 
     @property
     def array(self) -> Array:
@@ -96,7 +97,9 @@ class ExcitedPrior:
 
     def __post_init__(self) -> None:
         if not isinstance(self.monitor, ExcitationMonitor):
-            raise InputError(f"ExcitedPrior: expected ExcitationMonitor(design_excitation(model)), got {self.monitor!r}")
+            raise InputError(
+                f"ExcitedPrior: expected ExcitationMonitor(design_excitation(model)), got {self.monitor!r}"
+            )
         object.__setattr__(self, "alpha", positive("ExcitedPrior: alpha", self.alpha))
         if not (self.guarantee is None or isinstance(self.guarantee, JointGuarantee)):
             raise InputError(f"ExcitedPrior: guarantee must be a JointGuarantee(...), got {self.guarantee!r}")
@@ -178,9 +181,7 @@ class ExcitedPrior:
         found = log.first_from(t) or log.first_from(log.last_time)
         return None if found is None else Row.of(found[1], self._count)
 
-    def _levels(
-        self, mhe: MHE, state: State, log: Log, solved: Solved, level: float
-    ) -> tuple[Array, tuple[str, ...]]:
+    def _levels(self, mhe: MHE, state: State, log: Log, solved: Solved, level: float) -> tuple[Array, tuple[str, ...]]:
         """Return `Errors` of level and theorem (6,) after a solve, and what stands against them."""
         levels = joint_levels(self, mhe)
         start, last = float(solved.part("t")[0]), self._row(log, log.last_time)
@@ -189,14 +190,16 @@ class ExcitedPrior:
             found = log.first_from(start - mhe.slack(start))
             if found is not None and found[0] <= start + mhe.slack(start):
                 row = Row.of(found[1], self._count).bounds[:-1]
-        initial = levels.initial(state.start)
-        told = (initial.told,) * 2 if last is None else (last.bounds[2], last.bounds[5])
-        if growing:
+        initial = levels.initial(state.start) if growing or last is None else None
+        told = (last.bounds[2], last.bounds[5]) if last is not None else (levels.cap_p, levels.cap_p)
+        if initial is not None:
+            told = told if last is not None else (initial.told, initial.told)
             before = (initial, initial)
         elif row is not None:
-            before = (Errors(*row[:3]), Errors(*row[3:]))
+            before = (Errors(row[0], row[1], row[2]), Errors(row[3], row[4], row[5]))
         else:  # between solves: of states only the domain is known
-            prior = levels.cap_p if last is None else max(last.bounds[1], last.bounds[4], *told)
+            assert last is not None
+            prior = max(last.bounds[1], last.bounds[4], *told)
             before = (Errors(levels.cap_x, prior, prior),) * 2
         return levels.after(mhe, state, solved, before, told, level, aligned=growing or row is not None)
 
@@ -295,7 +298,8 @@ def _still(model: Model, p: Array) -> bool:
     """Return whether it can be seen from a model's expressions that without disturbance these states stay."""
     if not model.dynamics.is_a("SXFunction"):
         return False
-    t, x, u, q = (ca.SX.sym(key, size) for key, size in zip("txup", (1, *map(len, (model.x, model.u, model.p)))))
+    sizes = (1, len(model.x), len(model.u), len(model.p))
+    t, x, u, q = (ca.SX.sym(key, size) for key, size in zip("txup", sizes, strict=True))
     value = model.dynamics(t, x, u, np.zeros(len(model.w)), q)
     rest = value - x if model.step is not None else value
     return all(ca.simplify(rest[int(i)]).is_zero() for i in p)

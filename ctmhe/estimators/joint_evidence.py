@@ -193,9 +193,7 @@ def joint_levels(prior: ExcitedPrior, mhe: MHE) -> JointLevels:
     (x_low, x_up), (p_low, p_up) = box_of(design, "x"), box_of(design, "p")
     cap_p = largest_square(guarantee.excited.S, p_up - p_low)
     scaled = guarantee.states.scaled(guarantee.weights.scale)
-    bounds = JointBounds(
-        guarantee, horizon, prior.alpha, sizes, largest_square(scaled.P_upper, x_up - x_low), cap_p
-    )
+    bounds = JointBounds(guarantee, horizon, prior.alpha, sizes, largest_square(scaled.P_upper, x_up - x_low), cap_p)
     unproved = [] if unmet else list(_unproved(bounds, mhe))
     return JointLevels(guarantee, design, bounds, tuple(unmet), tuple(unproved))
 
