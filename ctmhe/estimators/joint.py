@@ -190,17 +190,18 @@ class ExcitedPrior:
             found = log.first_from(start - mhe.slack(start))
             if found is not None and found[0] <= start + mhe.slack(start):
                 row = Row.of(found[1], self._count).bounds[:-1]
-        initial = levels.initial(state.start) if growing or last is None else None
-        told = (last.bounds[2], last.bounds[5]) if last is not None else (levels.cap_p, levels.cap_p)
-        if initial is not None:
-            told = told if last is not None else (initial.told, initial.told)
+        told = None if last is None else (float(last.bounds[2]), float(last.bounds[5]))
+        initial = levels.initial(state.start) if growing or told is None else None
+        if told is None:
+            told = (initial.told, initial.told) if initial is not None else (levels.cap_p, levels.cap_p)
+        if growing and initial is not None:
             before = (initial, initial)
         elif row is not None:
             before = (Errors(row[0], row[1], row[2]), Errors(row[3], row[4], row[5]))
         else:  # between solves: of states only the domain is known
-            assert last is not None
-            prior = max(last.bounds[1], last.bounds[4], *told)
-            before = (Errors(levels.cap_x, prior, prior),) * 2
+            prior = max(*told, *([] if last is None else [last.bounds[1], last.bounds[4]]))
+            known = Errors(levels.cap_x, prior, prior)
+            before = (known, known)
         return levels.after(mhe, state, solved, before, told, level, aligned=growing or row is not None)
 
     def _carried(self, mhe: MHE, state: State, since: float, trajectory: Trajectory, p: Array) -> Array:

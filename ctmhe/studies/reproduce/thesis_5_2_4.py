@@ -35,7 +35,9 @@ PUBLISHED = {
 def schemes() -> tuple[dict[str, MHE], int]:
     """Return the estimators, and N_min of their weights."""
     model = chua_discrete()
-    alpha = ALPHA * float(model.p.nominal[0]) ** 2  # the level is that of p over its nominal 0.45, the thesis' that of p
+    alpha = (
+        ALPHA * float(model.p.nominal[0]) ** 2
+    )  # the level is that of p over its nominal 0.45, the thesis' that of p
     states, design = detect_states(model, eta=ETA_X), design_excitation(model, mu=MU)
     excited = design.excited_set(alpha)
     weights = joint_weights(states, excited, eta_1=ETA_1, eta_2=ETA_2, caution=CAUTION)
