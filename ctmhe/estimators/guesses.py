@@ -54,7 +54,7 @@ def warm_start(stage: StageFunction, state: State, window: Window) -> Guess:
     w = np.where(inside, last.w[slot], 0.0)
     for k in np.flatnonzero(mesh.shared):
         w[k + 1] = w[k]  # the last cell goes on with its w
-    p = state.p if window.p_estimated else window.prior[stage.nx :]
+    p = last.p if window.p_estimated else window.prior[stage.nx :]
     try:
         carry_forward(stage, window, x, w, p, max(old - 1, 0))
     except FloatingPointError:

@@ -20,7 +20,7 @@ from ctmhe.errors import InputError, NotEstimated, TooLate
 from ctmhe.estimators.guaranteed import Guaranteed
 from ctmhe.estimators.guesses import open_loop, resting_guess, starting_points
 from ctmhe.estimators.outlook import carried_covariance, prior_covariance
-from ctmhe.estimators.priors import Anchor, Filtering, Prior, prior_of
+from ctmhe.estimators.priors import Anchor, Filtering, Prior, Told, prior_of
 from ctmhe.estimators.state import State, load_state, save_state
 from ctmhe.estimators.trajectories import empty_path, path_at, path_rows, trajectory_at
 from ctmhe.models.continuous import Model
@@ -184,6 +184,7 @@ class MHE:
             raise InputError("max_iterations and deadline are for Gauss-Newton; IPOPT runs to convergence")
         self.horizon = np.inf if horizon == np.inf else positive("horizon", horizon, "seconds")
         self.prior = prior_of(prior)
+        self._says: Callable[..., Told] | None = getattr(self.prior, "told", None)
         if model.step is not None:
             if integrator is not None:
                 raise InputError("integrator: a DiscreteModel has its own step map; leave the integrator out")
@@ -619,6 +620,11 @@ class MHE:
         memory = self.prior.after(self, new, solved)
         if memory is not new.memory:
             new = made(State, new.__dict__ | {"memory": memory})
+        if self._says is not None:
+            told = self._says(self, new, solved)
+            x, p = told.value[: self.stage.nx], told.value[self.stage.nx :]
+            new, bound = made(State, new.__dict__ | {"x": x, "p": p}), told.bound or bound
+            status = replace(status, notes=(*status.notes, *told.notes)) if told.notes else status
 
         def covariance() -> tuple[Array, int]:
             window, _ = self._window(state, t)

@@ -16,7 +16,7 @@ from ctmhe.data.log import Log
 from ctmhe.errors import InputError
 from ctmhe.estimators.trajectories import empty_path, lagged_rows, path_at, trajectory_at
 from ctmhe.transcription.solved import Solved
-from ctmhe.types import Array, frozen
+from ctmhe.types import Array, ErrorBound, frozen
 
 if TYPE_CHECKING:
     from ctmhe.estimators.mhe import MHE
@@ -48,11 +48,30 @@ class Anchor:
     weight: Array | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Told:
+    """What an estimate says in place of its window's end, where a prior has a say in that: its method `told`.
+
+    Attributes
+    ----------
+    value : array (nx + np,)
+        State and parameters.
+    notes : tuple of str
+        For the status of the estimate.
+    bound : ErrorBound, optional
+    """
+
+    value: Array
+    notes: tuple[str, ...] = ()
+    bound: ErrorBound | None = None
+
+
 @runtime_checkable
 class Prior(Protocol):
     """The prior of every window: a rule, without state of its own.
 
-    `reach` is for how many seconds before the horizon it needs measurements and inputs.
+    `reach` is for how many seconds before the horizon it needs measurements and inputs. One that also has a method
+    `told(mhe, state, solved) -> Told`, asked last, has a say in what the estimate says.
     """
 
     reach: float
