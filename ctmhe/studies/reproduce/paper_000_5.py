@@ -74,7 +74,7 @@ def one_seed(seed: int, *, steps: int = STEPS, size: float = 1.0) -> dict[str, A
 
 
 def reproduce(
-    *, seeds: int = 5, workers: int = 1, progress: bool = False, steps: int = STEPS, **_: Any
+    *, seeds: int = 3, workers: int = 1, progress: bool = False, steps: int = STEPS, **_: Any
 ) -> dict[str, Any]:
     """Run the scheme with the printed noise, and with a thousandth of it, where its bound (9) says something.
 
