@@ -156,6 +156,6 @@ COMMENT = (
     "program at lambda = 0.911 (a = 1, no epsilons); S_0 = 1e-3 and alpha = 1e-6 are chosen, and S_0 hardly matters: "
     "lambda^N = 8e-9. (33) with kappa = 1e7 holds throughout. (34) depends on the alpha, which is not printed either: "
     "in the rest near x1 = 0 after the first convergence, of which the paper speaks, the level falls by five decades, "
-    "and the parameter may be anywhere in its box. There a tenth of the solves does not converge; they are stopped "
+    "and the parameter may be anywhere in its box. There many solves do not converge, a sixth of all; they are stopped "
     "after 60 iterations. With noise of 0.1 the bound (9) is as wide as the domain; at a thousandth of it it is not."
 )
