@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -186,7 +187,7 @@ def test_directions_move_what_is_excited_and_keep_the_rest():
     _, whole = mixed(ExcitedPrior(watch, alpha), np.sin)
     assert whole[-1].p[0] == 0.8 and whole[-1].p[1] == 0.05  # all or nothing: nothing
     nominal, moved = found.nominal, 0
-    for before, now in zip(kept[:-1], kept[1:], strict=True):
+    for before, now in pairwise(kept):
         basis = watch.along(now.trajectory).excited(alpha)
         change, offered = (now.p - before.p) / nominal, (now.trajectory.p - before.p) / nominal
         np.testing.assert_allclose(change, basis @ (basis.T @ offered), atol=1e-9)
@@ -303,7 +304,7 @@ def stranger(x=("x1", "x2", "x3"), p=("p",)):
     """An estimator of a model with other names than the monitor's."""
     own = chua_discrete()
     model = DiscreteModel(
-        lambda t, x, u, w, p: own.dynamics(t, x, u, w, p), lambda t, x, u, w, p: x[0] + w[3],
+        own.dynamics, lambda t, x, u, w, p: x[0] + w[3],
         step=0.01, x=x, w=own.w.names, p=p, y="voltage",
     )  # fmt: skip
     P = np.eye(4)
