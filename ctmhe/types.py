@@ -354,6 +354,8 @@ class ErrorBound:
     P_lower : array (nx, nx)
     cap : float
         Bound of U between any two states of the domain; a bound that is not smaller says nothing.
+    own : array, optional
+        Bounds of single errors, where better ones are known than what the norm implies.
     """
 
     level: float | None
@@ -361,6 +363,7 @@ class ErrorBound:
     reasons: tuple[str, ...]
     P_lower: Array
     cap: float = float("inf")
+    own: Array | None = None
 
     @property
     def size(self) -> float | None:
@@ -375,10 +378,11 @@ class ErrorBound:
 
     @property
     def radii(self) -> Array | None:
-        """Bound of every |x_hat_i - x_i| (nx,), in the units of the states."""
+        """Bound of every |x_hat_i - x_i| (nx,), in the units of the states; in joint estimation then of parameters."""
         if self.size is None:
             return None
-        return frozen(self.size * np.sqrt(np.diagonal(np.linalg.inv(self.P_lower))))
+        implied = self.size * np.sqrt(np.diagonal(np.linalg.inv(self.P_lower)))
+        return frozen(implied if self.own is None else np.minimum(implied, self.own))
 
     def __str__(self) -> str:
         if self.size is None:

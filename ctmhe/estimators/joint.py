@@ -137,13 +137,14 @@ class ExcitedPrior:
         kept = self._carried(mhe, state, start, trajectory, solved.part("prior")[place.p])
         told = kept if before is None else self._carried(mhe, state, log.last_time, trajectory, before.told)
         information = self.monitor.along(place.seen(trajectory))
-        level = information.level if self._measured(mhe, state, start) else 0.0
+        measured = self._measured(mhe, state, start)
+        level = max(information.level, 0.0) if measured else 0.0
         whole, move = level >= self.alpha, None
-        if self.directions and not whole and level > 0.0:
+        if self.directions and measured and not whole:
             move = self._projection(information)
         full = state.t - state.t0 >= mhe.horizon - slack
         seen = np.full(self._count, -np.inf) if before is None else before.seen
-        if level > 0.0:
+        if measured:
             seen = np.where(marginal(information) >= self.alpha, state.t, seen)
         row = Row(
             float(whole and full), level, _moved(kept, found, whole, move) if full else kept,

@@ -118,9 +118,14 @@ class JointLevels:
         proved = not reasons and np.isfinite(theorem)
         if not reasons and not proved:
             reasons = ("nothing bounds the error to start from: give JointGuarantee(error=), or a bounded domain",)
-        return ErrorBound(
-            level if known else None, theorem if proved else None, reasons, self.metric, self.cap_x + self.cap_p
-        )
+        used = [part for part, use in ((errors[:3], known), (errors[3:], proved)) if use]
+        own, nx = None, len(self.bounds.states.P_lower)
+        if used:
+            sizes = np.diagonal(np.linalg.inv(self.metric))
+            state, parameters = (min(float(part[i]) for part in used) for i in (0, 2))
+            own = frozen(np.sqrt(np.append(state * sizes[:nx], parameters * sizes[nx:])))
+        numbers = level if known else None, theorem if proved else None
+        return ErrorBound(*numbers, reasons, self.metric, self.cap_x + self.cap_p, own)
 
 
 DATA = "this window: "

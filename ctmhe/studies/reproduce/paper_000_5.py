@@ -19,6 +19,7 @@ TRUTH, P_TRUE, GUESS = [2.0, 0.1, -2.0], [0.45], np.array([0.0, 0.0, 0.0, 0.2])
 SIZES = np.array([1e-3, 1e-3, 1e-3, 0.1])
 LAMBDA, KAPPA, HORIZON, STEPS = 0.911, 1e7, 200, 1000
 S_0, ALPHA = 1e-3, 1e-6
+ITERATIONS = 60
 WEAK = (400, 600)
 
 
@@ -32,7 +33,8 @@ def scheme(size: float = 1.0) -> tuple[MHE, JointCertificate]:
     largest = dict(zip(model.w.names, size * SIZES, strict=True))
     prior = CheckedPrior(joint, kappa=KAPPA, disturbance=largest)
     horizon = HORIZON * float(model.step or 1.0)
-    return MHE(model, horizon=horizon, cost=joint.cost(), bounds=domain, prior=prior), joint
+    settings = {"cost": joint.cost(), "bounds": domain, "prior": prior, "max_iterations": ITERATIONS}
+    return MHE(model, horizon=horizon, **settings), joint
 
 
 def one_seed(seed: int, *, steps: int = STEPS, size: float = 1.0) -> dict[str, Any]:
@@ -72,7 +74,7 @@ def one_seed(seed: int, *, steps: int = STEPS, size: float = 1.0) -> dict[str, A
 
 
 def reproduce(
-    *, seeds: int = 10, workers: int = 1, progress: bool = False, steps: int = STEPS, **_: Any
+    *, seeds: int = 3, workers: int = 1, progress: bool = False, steps: int = STEPS, **_: Any
 ) -> dict[str, Any]:
     """Run the scheme with the printed noise, and with a thousandth of it, where its bound (9) says something.
 
@@ -129,7 +131,7 @@ def reproduce(
                 "median guaranteed radius of p": summary([run["radius"] for run in quiet]),
                 "(34) holds in all steps": all(run["unexcited"] == 0 for run in quiet),
             },
-            "failed_solves": sum(run["failures"] for run in (*loud, *quiet)),
+            "solves_stopped_at_the_limit": float(np.mean([run["failures"] for run in loud])) / steps,
         },
         "settings": {
             "seeds": seeds,
@@ -137,6 +139,7 @@ def reproduce(
             "N": HORIZON,
             "lambda": LAMBDA,
             "kappa": KAPPA,
+            "most_iterations": ITERATIONS,
             "S_0": S_0,
             "alpha": ALPHA,
             "P, L, Q, R": "our own design at lambda = 0.911 on |x1| <= 5",
@@ -149,9 +152,10 @@ def reproduce(
 
 
 COMMENT = (
-    "The paper shows one run in a figure, without numbers. P, Q, R, a and S_0 are not printed: ours come from one program "
-    "at lambda = 0.911 (a = 1, no epsilons), S_0 = 1e-3 and alpha = 1e-6 are chosen. (33) with kappa = 1e7 holds "
-    "throughout. (34) depends on the alpha, which is not printed either: in the rest near x1 = 0 after the first "
-    "convergence, which the paper speaks of, the level falls by five decades and the parameter is anywhere in its box. "
-    "With noise of 0.1 the bound (9) is as wide as the domain; at a thousandth of it it is not."
+    "The paper shows one run in a figure, without numbers. P, Q, R, a and S_0 are not printed: ours come from one "
+    "program at lambda = 0.911 (a = 1, no epsilons); S_0 = 1e-3 and alpha = 1e-6 are chosen, and S_0 hardly matters: "
+    "lambda^N = 8e-9. (33) with kappa = 1e7 holds throughout. (34) depends on the alpha, which is not printed either: "
+    "in the rest near x1 = 0 after the first convergence, of which the paper speaks, the level falls by five decades, "
+    "and the parameter may be anywhere in its box. There many solves do not converge, a sixth of all; they are stopped "
+    "after 60 iterations. With noise of 0.1 the bound (9) is as wide as the domain; at a thousandth of it it is not."
 )

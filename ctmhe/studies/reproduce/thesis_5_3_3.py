@@ -19,7 +19,8 @@ from ctmhe.types import Array, Bounds, DiscountedCost
 TRUTH, GUESS = [2.0, 0.0, -1.0, 0.45], np.array([-1.0, 0.1, 2.0, 0.6])
 SIZES = np.array([1e-3, 1e-3, 1e-3, 5e-2, 1e-4])  # w1, w2, w3, noise, w4
 HORIZON, STEPS, ETA, ALPHA, MU = 200, 4000, 0.9, 5e-4, 0.747
-PERIODS = (4000, 2000)
+PERIODS = (500, 250)
+ITERATIONS = 60
 HEADS = ("RMSE(e_x)", "RMSE(e_p)", "largest |e_p| after 200 steps", "tau_avg [ms]")
 
 
@@ -41,7 +42,8 @@ def schemes() -> dict[str, MHE]:
     monitor = ExcitationMonitor(design_excitation(plant, mu=MU))
     priors = {"without monitoring": "filtering", "with monitoring": ExcitedPrior(monitor, alpha)}
     horizon = HORIZON * float(plant.step or 1.0)
-    return {name: MHE(world, horizon=horizon, cost=cost, bounds=bounds, prior=prior) for name, prior in priors.items()}
+    settings = {"horizon": horizon, "cost": cost, "bounds": bounds, "max_iterations": ITERATIONS}
+    return {name: MHE(world, prior=prior, **settings) for name, prior in priors.items()}
 
 
 def one_seed(seed: int, *, steps: int = STEPS) -> dict[str, Any]:
@@ -57,7 +59,7 @@ def one_seed(seed: int, *, steps: int = STEPS) -> dict[str, Any]:
         found[name] = {
             "RMSE(e_x)": rmse(error[:, :3]),
             "RMSE(e_p)": rmse(error[:, 3:]),
-            "largest |e_p| after 200 steps": float(np.abs(error[HORIZON:, 3]).max()),
+            "largest |e_p| after 200 steps": float(np.abs(error[HORIZON:, 3]).max(initial=0.0)),
             "tau_avg [ms]": 1e3 * run["seconds"],
             "failures": sum(not result["success"] for result in run["results"]),
         }
@@ -67,7 +69,7 @@ def one_seed(seed: int, *, steps: int = STEPS) -> dict[str, Any]:
 
 
 def reproduce(
-    *, seeds: int = 10, workers: int = 1, progress: bool = False, steps: int = STEPS, **_: Any
+    *, seeds: int = 3, workers: int = 1, progress: bool = False, steps: int = STEPS, **_: Any
 ) -> dict[str, Any]:
     """Run both schemes.
 
@@ -102,7 +104,8 @@ def reproduce(
             ],
             "RMSE(e_p) without over with monitoring": summary(ratios),
             "share_of_steps_with_the_prior_kept": summary([run["kept"] for run in found]),
-            "failed_solves": sum(run["rows"][name]["failures"] for run in found for name in names),
+            "solves_stopped_at_the_limit": sum(run["rows"][name]["failures"] for run in found for name in names)
+            / (len(names) * len(found) * steps),
             "runs_that_stay_in_X": sum(run["inside"] for run in found),
         },
         "settings": {
@@ -117,6 +120,7 @@ def reproduce(
             "R": 1e3,
             "alpha": ALPHA,
             "mu_of_the_monitor": MU,
+            "most_iterations": ITERATIONS,
             "w4": f"sum of square waves of 5e-5 with periods of {PERIODS[0]} and {PERIODS[1]} steps",
             "disturbances": "bounded to their set",
             "guess": GUESS.tolist(),
@@ -126,8 +130,10 @@ def reproduce(
 
 
 COMMENT = (
-    "The thesis shows figures only, and says that errors with monitoring are much smaller than without. The waveform of "
-    "w4 is not printed: ours moves p between 0.45 and 0.55. P-bar is printed as I_2 and read as I_3, Q = 1e7 I_4 as the "
-    "weight of w1 to w4 with w5 the residual. The monitor's P and L are those of 5.2.4 in our own design. Kept is the "
-    "prior at every step whose window is not excited; p_hat is then carried along g (Remark 5.2)."
+    "The thesis shows figures only, and says that errors with monitoring are much smaller than without. The waveform "
+    "of w4 is not printed: with ours p goes to and fro between 0.45 and 0.4625. Slower waves move p further, but then "
+    "the circuit leaves X for a larger limit cycle (|x3| about 10) sooner or later, which the estimator cannot follow. "
+    "P-bar is printed as I_2 and read as I_3, Q = 1e7 I_4 as the weight of w1 to w4 with w5 the residual. The monitor "
+    "has P and L of our own design for 5.2.4. Kept is the prior at every step whose window is not excited; p_hat is "
+    "then carried along g (Remark 5.2). Solves stop after 60 iterations."
 )
