@@ -748,10 +748,10 @@ class MHE:
             fields["track"], bound = self.guaranteed.after(track, first, t, cost, status, reasons, given)
             fields["doubts"] = self.guaranteed.current(known, times, edge - self.prior.reach - slack)
         new = made(State, state.__dict__ | fields)
-        # the prior may look at data that no window needs any more, and at what is doubtful about them
-        passing = {"measurements": state.measurements, "inputs": inputs, "doubts": known}
-        memory = self.prior.after(self, made(State, new.__dict__ | passing), solved)
-        if memory is not new.memory:
+        if type(self.prior) is not Filtering:  # a prior that remembers
+            # it may look at data that no window needs any more, and at what is doubtful about them
+            passing = {"measurements": state.measurements, "inputs": inputs, "doubts": known}
+            memory = self.prior.after(self, made(State, new.__dict__ | passing), solved)
             new = made(State, new.__dict__ | {"memory": memory})
         if self.suboptimal is not None and bound is not None:
             new = made(State, new.__dict__ | {"memory": self.suboptimal.bounded(self, new, bound)})
