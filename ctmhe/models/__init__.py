@@ -3,5 +3,6 @@
 from ctmhe.models.continuous import ContinuousModel, Model
 from ctmhe.models.discrete import DiscreteModel
 from ctmhe.models.signals import Signals
+from ctmhe.models.varying import varying_parameters
 
-__all__ = ["ContinuousModel", "DiscreteModel", "Model", "Signals"]
+__all__ = ["ContinuousModel", "DiscreteModel", "Model", "Signals", "varying_parameters"]
