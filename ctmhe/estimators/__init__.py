@@ -1,5 +1,8 @@
 """Estimators on explicit state."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
 from ctmhe.estimators.arrival import ArrivalUpdate
 from ctmhe.estimators.base import Estimator
 from ctmhe.estimators.filter import Filter
@@ -15,11 +18,17 @@ from ctmhe.estimators.state import State
 from ctmhe.estimators.suboptimal import Suboptimal
 from ctmhe.estimators.unscented import Unscented
 
+if TYPE_CHECKING:
+    from ctmhe.estimators.checked import CheckedPrior
+    from ctmhe.estimators.joint import ExcitedPrior
+
 __all__ = [
     "MHE",
     "AdaptiveArrival",
     "ArrivalUpdate",
+    "CheckedPrior",
     "Estimator",
+    "ExcitedPrior",
     "Extended",
     "Filter",
     "FilterState",
@@ -37,3 +46,12 @@ __all__ = [
     "norm_bounded",
     "polytopic_horizon",
 ]
+
+_LATER = {"CheckedPrior": "checked", "ExcitedPrior": "joint"}
+
+
+def __getattr__(name: str) -> Any:
+    """Return what needs parts of SciPy that other estimators do without, imported when asked for."""
+    if name not in _LATER:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_LATER[name]}"), name)

@@ -5,6 +5,7 @@ from ctmhe.models.discrete import DiscreteModel
 from ctmhe.models.observer import observer_model
 from ctmhe.models.polytope import mixture, polytope
 from ctmhe.models.signals import Signals
+from ctmhe.models.varying import varying_parameters
 
 __all__ = [
     "ContinuousModel",
@@ -14,4 +15,5 @@ __all__ = [
     "mixture",
     "observer_model",
     "polytope",
+    "varying_parameters",
 ]

@@ -33,7 +33,7 @@ def scheme(size: float = 1.0) -> tuple[MHE, JointCertificate]:
     largest = dict(zip(model.w.names, size * SIZES, strict=True))
     prior = CheckedPrior(joint, kappa=KAPPA, disturbance=largest)
     horizon = HORIZON * float(model.step or 1.0)
-    settings = {"cost": joint.cost(), "bounds": domain, "prior": prior, "max_iterations": ITERATIONS}
+    settings: dict[str, Any] = {"cost": joint.cost(), "bounds": domain, "prior": prior, "max_iterations": ITERATIONS}
     return MHE(model, horizon=horizon, **settings), joint
 
 
@@ -97,7 +97,7 @@ def reproduce(
         over_seeds(partial(one_seed, steps=steps, size=size), seeds, workers=workers, progress=progress)
         for size in (1.0, 1e-3)
     )
-    _, joint = scheme()
+    joint = scheme()[1]
     contraction = 4 * KAPPA * LAMBDA**HORIZON
     return {
         "case": "paper000-5",

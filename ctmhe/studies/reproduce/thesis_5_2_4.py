@@ -14,6 +14,7 @@ from ctmhe.certificates.joint_horizons import joint_horizon
 from ctmhe.certificates.weights import detect_states, joint_weights
 from ctmhe.estimators.joint import ExcitedPrior
 from ctmhe.estimators.mhe import MHE
+from ctmhe.models.continuous import box_arrays
 from ctmhe.models.library import chua_discrete
 from ctmhe.studies.reproduce.joint_runs import over_seeds, rmse, summary, track
 
@@ -75,7 +76,7 @@ def one_seed(seed: int, *, steps: int = STEPS) -> dict[str, Any]:
         if level is not None or theorem is not None
     ]
     kept = np.mean([bool(result["notes"]) for result in runs["MHE2"]["results"]])
-    lower, upper = (np.array(side) for side in zip(*model.bounds.x.values(), strict=True))
+    lower, upper = box_arrays(model.x, model.bounds.x, "X")
     return {
         "rows": rows,
         "kept": float(kept),

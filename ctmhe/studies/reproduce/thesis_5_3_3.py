@@ -11,6 +11,7 @@ from ctmhe.certificates.excitation import ExcitationMonitor
 from ctmhe.certificates.excitation_design import design_excitation
 from ctmhe.estimators.joint import ExcitedPrior
 from ctmhe.estimators.mhe import MHE
+from ctmhe.models.continuous import box_arrays
 from ctmhe.models.library import chua_discrete
 from ctmhe.models.varying import varying_parameters
 from ctmhe.studies.reproduce.joint_runs import over_seeds, rmse, summary, track
@@ -64,7 +65,7 @@ def one_seed(seed: int, *, steps: int = STEPS) -> dict[str, Any]:
             "failures": sum(not result["success"] for result in run["results"]),
         }
     kept = np.mean([bool(result["notes"]) for result in runs["with monitoring"]["results"]])
-    lower, upper = (np.array(side) for side in zip(*world.bounds.x.values(), strict=True))
+    lower, upper = box_arrays(world.x, world.bounds.x, "X")
     return {"rows": found, "kept": float(kept), "inside": bool(((truth >= lower) & (truth <= upper)).all())}
 
 
