@@ -5,6 +5,7 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
+from ctmhe.models.continuous import ContinuousModel
 from ctmhe.models.discrete import DiscreteModel
 from ctmhe.models.polytope import mixture, polytope
 from ctmhe.types import Array
@@ -16,7 +17,7 @@ SINE_A = ([[0, 1.30], [1, -1.52]], [[0, -2.44], [1, 0.66]], [[0, 1.31], [1, 2.81
 SINE_C = [[0.5, 0.5]]
 
 
-def unknown_linear() -> DiscreteModel:
+def unknown_linear() -> ContinuousModel:
     """Return the polytope of three linear systems in observer form, A_i = [0 a_1; 1 a_2], C_i = [c_1 c_2].
 
     The system lies at the weights (0.22, 0.76, 0.02), the nominal model at (0.41, 0.22, 0.37), which is where p starts.
@@ -75,7 +76,7 @@ def sine_drift(start: float, steps: int) -> Array:
     return p
 
 
-def sine_polytope() -> DiscreteModel:
+def sine_polytope() -> ContinuousModel:
     """Return the polytope that the paper sets beside `drifting_sine`.
 
     Its vertices are in observer form, [0 a_1; 1 a_2], and the system in the other, [0 1; p1 .]: as printed no mixture

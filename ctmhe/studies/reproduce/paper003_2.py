@@ -202,4 +202,12 @@ def reproduce(
     }
 
 
-COMMENT = ""
+COMMENT = (
+    "As printed, (77) drives p1 to zero within two steps, and the vertices (78) have a one where the system has p1: "
+    "no mixture is the system, and most of its state is the last two disturbances, so that all estimators are close, "
+    "far below the published errors, and adapting does not help. With p1 = 1 the polytope contains the linearised "
+    "system, and adapting beats EKF_R, FIE and MHE_R in sum, as the paper claims; the mode (1, -1) is all but "
+    "unobservable through C, which even the EKF that knows the system shows. EKF_R is the robust filter of the "
+    "polytope's middle, FIE linearises the true model at the last estimate. Errors hardly depend on l and N (Fig. 3, "
+    "p1 = 1)."
+)
