@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, partial
+from typing import Any
 
 import numpy as np
 
 from ctmhe.data.log import MeasurementLog
 from ctmhe.estimators.mhe import MHE
 from ctmhe.models.library import hover_speed, quadrotor_discrete
-from ctmhe.studies.reproduce.turnpike_runs import Experiment
+from ctmhe.studies.reproduce._offline import all_of
+from ctmhe.studies.reproduce.turnpike_runs import Experiment, judged, summary
 from ctmhe.types import Array, DiscountedCost
 
 STEPS, STEP, HORIZON, DELAYS = 1000, 0.05, 30, (1, 3, 15)
