@@ -27,31 +27,41 @@ are shown and not compared. [reproduced.md](reproduced.md) has the certificates 
 TIMES = ("ms", "tau", "time", "seconds")
 
 
-def leaves(value: Any, where: tuple[Any, ...] = ()) -> dict[tuple[Any, ...], Any]:
-    """Return the numbers and texts of a nested result by their place; {"mean", "std"} counts as one."""
-    if isinstance(value, dict) and not ("mean" in value and set(value) <= {"mean", "std", "n"}):
-        pairs = value.items()
-    elif isinstance(value, list):
-        pairs = enumerate(value)
+Place = tuple[Any, ...]
+
+
+def compared(published: Any, ours: Any, where: Place = ()) -> list[tuple[Place, Any, Any]]:
+    """Return place, published and our value wherever both have a number; columns that name a table's rows left out."""
+    if is_table(published) and is_table(ours):
+        labels = keys_of(published, ours)
+        rows = zip(published, ours, strict=False)
+        pairs = [((k, key), one[key], two[key]) for k, (one, two) in enumerate(rows) for key in one if key in two]
+        pairs = [pair for pair in pairs if pair[0][1] not in labels]
+    elif isinstance(published, dict) and isinstance(ours, dict) and "mean" not in published:
+        pairs = [((key,), published[key], ours[key]) for key in published if key in ours]
+    elif isinstance(published, list) and isinstance(ours, list):
+        pairs = [((k,), one, two) for k, (one, two) in enumerate(zip(published, ours, strict=False))]
     else:
-        return {where: value}
-    found: dict[tuple[Any, ...], Any] = {}
-    for key, inner in pairs:
-        found |= leaves(inner, (*where, key))
-    return found
+        known = number(published) is not None and number(ours) is not None
+        return [(where, published, ours)] if known else []
+    return [found for inner, one, two in pairs for found in compared(one, two, (*where, *inner))]
 
 
 def number(value: Any) -> float | None:
     """Return a leaf as a number, if it is one."""
     if isinstance(value, dict):
-        value = value["mean"]
+        value = value.get("mean")
     return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else None
 
 
 def said(value: Any) -> str:
-    """Return a leaf as text."""
+    """Return a leaf, or a few of them, as text for one cell."""
     if value is None:
         return "–"
+    if isinstance(value, dict) and "mean" not in value:
+        return "; ".join(f"{key} {said(inner)}" for key, inner in value.items())
+    if isinstance(value, list):
+        return ", ".join(said(inner) for inner in value)
     if isinstance(value, dict):
         spread = f" ({value['std']:.2g})" if value.get("std") is not None else ""
         return f"{value['mean']:.4g}{spread}" if value["mean"] is not None else "–"
@@ -60,16 +70,9 @@ def said(value: Any) -> str:
     return f"{value:d}" if isinstance(value, int) else f"{value:.4g}"
 
 
-def is_time(where: tuple[Any, ...]) -> bool:
+def is_time(where: Place) -> bool:
     """Whether a place holds a computing time."""
     return any(isinstance(key, str) and any(word in key.lower().split("_") for word in TIMES) for key in where)
-
-
-def compared(result: dict[str, Any]) -> list[tuple[tuple[Any, ...], Any, Any]]:
-    """Return place, published and our value wherever both have a number."""
-    ours = leaves(result["ours"])
-    pairs = [(where, value, ours[where]) for where, value in leaves(result["published"]).items() if where in ours]
-    return [pair for pair in pairs if number(pair[1]) is not None and number(pair[2]) is not None]
 
 
 def off(published: Any, mine: Any) -> float:
@@ -85,12 +88,18 @@ def is_table(value: Any) -> bool:
 
 
 def keys_of(rows: list[dict[str, Any]], mine: list[dict[str, Any]]) -> list[str]:
-    """Return the columns that say which row it is: the same in both, and no averages."""
-    first = [key for key in rows[0] if all(key in row for row in (*rows, *mine))]
-    return [key for key in first if all(a[key] == b[key] for a, b in zip(rows, mine, strict=False))]
+    """Return the leading columns that say which row it is: the same in both, and no averages."""
+    found: list[str] = []
+    for key in rows[0]:
+        if any(key not in row or isinstance(row[key], dict) for row in (*rows, *mine)):
+            break
+        if any(a[key] != b[key] for a, b in zip(rows, mine, strict=False)):
+            break
+        found.append(key)
+    return found
 
 
-def rows_of(name: tuple[Any, ...], published: Any, ours: Any) -> list[str]:
+def rows_of(name: Place, published: Any, ours: Any) -> list[str]:
     """Return Markdown of one part of a result: a table beside ours, or lines of single values."""
     if is_table(published) and is_table(ours):
         labels = keys_of(published, ours)
@@ -118,15 +127,10 @@ def rows_of(name: tuple[Any, ...], published: Any, ours: Any) -> list[str]:
                 single[key] = inner
         if single:
             head = [f"**{' '.join(map(str, name))}**\n"] if name else []
-            table = [f"| {key} | {flat(one)} | {flat(two)} |" for key, (one, two) in single.items()]
+            table = [f"| {key} | {said(one)} | {said(two)} |" for key, (one, two) in single.items()]
             lines = [*head, "| | published | ours |", "|---|---|---|", *table, "", *lines]
         return lines
     return []
-
-
-def flat(value: Any) -> str:
-    """Return a short list or a leaf in one cell."""
-    return ", ".join(flat(inner) for inner in value) if isinstance(value, list) else said(value)
 
 
 def page() -> str:
@@ -135,7 +139,8 @@ def page() -> str:
     results = {name: json.loads(path.read_text("utf-8")) for name, path in files.items() if path.exists()}
     lines = ["| case | values compared | within 1 % | within 10 % | median difference |", "|---|---|---|---|---|"]
     for name, result in results.items():
-        found = [off(one, two) for where, one, two in compared(result) if not is_time(where)]
+        pairs = compared(result["published"], result["ours"])
+        found = [off(one, two) for where, one, two in pairs if not is_time(where)]
         counts = [sum(d <= limit for d in found) for limit in (0.01, 0.1)]
         cells = [str(len(found)), *map(str, counts), f"{median(found):.2g}"] if found else ["0", "–", "–", "–"]
         lines.append(f"| [`{name}`](#{name.replace('.', '')}) | {' | '.join(cells)} |")
