@@ -208,8 +208,8 @@ class Ipopt:
             "g": ca.vertcat(*constraints),
         }
         options = dict(self.options)
-        if slot.is_a("SXFunction") and size * slot.n_instructions() < EXPANDED:
-            options["expand"] = True  # one scalar program instead of calls: small ones are all overhead
+        if self.limited and slot.is_a("SXFunction") and size * slot.n_instructions() < EXPANDED:
+            options["expand"] = True  # one scalar program: in few iterations calls are all overhead
         if not stage.symbolic:
             options["hess_lag"] = _gauss_newton_hessian(problem, every)
         solver = ca.nlpsol("reference", "ipopt", problem, options)
