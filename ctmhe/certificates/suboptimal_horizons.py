@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from ctmhe.certificates.certificate import DetectabilityCertificate, largest_ratio
-from ctmhe.certificates.increments import Increments
-from ctmhe.certificates.observers import ObserverFunction
+from ctmhe.certificates.observer_function import ObserverFunction
 from ctmhe.errors import InputError
 from ctmhe.models.continuous import Model
 from ctmhe.types import Array, Bounds
@@ -34,6 +33,8 @@ class Lipschitz:
     @classmethod
     def of(cls, model: Model, domain: Bounds | None = None, *, u: Any = None) -> Lipschitz:
         """Return those of a model on a domain: the largest norms of the Jacobians that cover it."""
+        from ctmhe.certificates.increments import Increments  # late: it needs much of SciPy
+
         cover = Increments(model, domain, u=u).cover("ABCD")
         A, B, _, C, D, _ = (np.linalg.norm(part, 2, axis=(1, 2)).max(initial=0.0) for part in cover.jacobians)
         return cls(float(max(A, B, 1.0)), float(max(C, D)), cover.rigorous)

@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from ctmhe.certificates.guarantee import WindowStart
-from ctmhe.certificates.observers import LuenbergerObserver
+from ctmhe.certificates.observer_function import LuenbergerObserver
 from ctmhe.data.log import Log
 from ctmhe.data.window import held_inputs
 from ctmhe.errors import InputError

@@ -7,11 +7,10 @@ from hashlib import sha256
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from ctmhe.certificates.certificate import largest_ratio
 from ctmhe.certificates.guarantee import WindowStart, largest_square
-from ctmhe.certificates.observers import LuenbergerObserver
+from ctmhe.certificates.observer_function import LuenbergerObserver
 from ctmhe.certificates.suboptimal_horizons import Lipschitz, cost_factor
 from ctmhe.errors import InputError
 from ctmhe.models.continuous import Model, box_arrays
@@ -69,7 +68,7 @@ class SuboptimalBounds:
         self.function, self.system, self.energy = V, U, mhe.guaranteed.bounds.energy
         sizes = mhe.guaranteed.sizes
         places = [model.w.index(name) for name in (*self.observer.process, *self.observer.noise)]
-        self.supply = largest_square(np.asarray(block_diag(V.Q, V.R)), np.asarray(sizes)[places])
+        self.supply = largest_square(_beside(V.Q, V.R), np.asarray(sizes)[places])
         self.to_system = largest_ratio(U.P_upper, V.P_lower)
         self.to_observer = largest_ratio(V.P_upper, U.P_lower)
         self.unit = model.step or 1.0
@@ -251,3 +250,11 @@ def additive(model: Model, process: list[int]) -> bool:
         if len(process) != len(model.x) or not np.allclose(moved - plain, w[process], rtol=1e-9, atol=1e-12):
             return False
     return True
+
+
+def _beside(first: Array, second: Array) -> Array:
+    """Return the block-diagonal matrix of two."""
+    n = len(first)
+    whole = np.zeros((n + len(second), n + len(second)))
+    whole[:n, :n], whole[n:, n:] = first, second
+    return whole
