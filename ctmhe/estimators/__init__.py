@@ -3,24 +3,24 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from ctmhe.estimators.arrival import ArrivalUpdate
 from ctmhe.estimators.base import Estimator
-from ctmhe.estimators.filter import Filter
-from ctmhe.estimators.filter_state import FilterState
-from ctmhe.estimators.kalman import Extended, Kalman
-from ctmhe.estimators.kalman_weight import KalmanWeight
-from ctmhe.estimators.luenberger import Luenberger
+from ctmhe.estimators.filters.filter import Filter
+from ctmhe.estimators.filters.filter_state import FilterState
+from ctmhe.estimators.filters.kalman import Extended, Kalman
+from ctmhe.estimators.filters.luenberger import Luenberger
+from ctmhe.estimators.filters.robust_kalman import RobustKalman, norm_bounded
+from ctmhe.estimators.filters.unscented import Unscented
 from ctmhe.estimators.mhe import MHE, Prediction
-from ctmhe.estimators.offline import OfflineEstimate, estimate_offline
-from ctmhe.estimators.polytopic import AdaptiveArrival, dual_iterations, polytopic_horizon
-from ctmhe.estimators.robust_kalman import RobustKalman, norm_bounded
+from ctmhe.estimators.offline.nonlinear import OfflineEstimate, estimate_offline
+from ctmhe.estimators.priors.arrival import ArrivalUpdate
+from ctmhe.estimators.priors.kalman_weight import KalmanWeight
+from ctmhe.estimators.priors.polytopic import AdaptiveArrival, dual_iterations, polytopic_horizon
+from ctmhe.estimators.priors.suboptimal import Suboptimal
 from ctmhe.estimators.state import State
-from ctmhe.estimators.suboptimal import Suboptimal
-from ctmhe.estimators.unscented import Unscented
 
 if TYPE_CHECKING:
-    from ctmhe.estimators.checked import CheckedPrior
-    from ctmhe.estimators.joint import ExcitedPrior
+    from ctmhe.estimators.priors.checked import CheckedPrior
+    from ctmhe.estimators.priors.joint import ExcitedPrior
 
 __all__ = [
     "MHE",
@@ -47,7 +47,7 @@ __all__ = [
     "polytopic_horizon",
 ]
 
-_LATER = {"CheckedPrior": "checked", "ExcitedPrior": "joint"}
+_LATER = {"CheckedPrior": "priors.checked", "ExcitedPrior": "priors.joint"}
 
 
 def __getattr__(name: str) -> Any:

@@ -12,7 +12,7 @@ import numpy as np
 from ctmhe.certificates.certificate import DetectabilityCertificate
 from ctmhe.certificates.guarantee import Guarantee, Track, WindowBounds, WindowStart, largest_square
 from ctmhe.errors import InputError
-from ctmhe.estimators.priors import Filtering
+from ctmhe.estimators.priors.base import Filtering
 from ctmhe.models.continuous import Model, box_arrays
 from ctmhe.transcription.weights import weight_matrix
 from ctmhe.types import Array, ErrorBound, Outcome, Status

@@ -18,13 +18,13 @@ from ctmhe.data.log import Log
 from ctmhe.data.window import fed_inputs, held_inputs
 from ctmhe.errors import InputError, NotEstimated, TooLate
 from ctmhe.estimators.base import check_wait
-from ctmhe.estimators.decrease import improved
 from ctmhe.estimators.guaranteed import Guaranteed
 from ctmhe.estimators.guesses import open_loop, resting_guess, starting_points
 from ctmhe.estimators.outlook import carried_covariance, prior_covariance
-from ctmhe.estimators.priors import Anchor, Filtering, Prior, Told, prior_of
+from ctmhe.estimators.priors.base import Anchor, Filtering, Prior, Told, prior_of
+from ctmhe.estimators.priors.decrease import improved
+from ctmhe.estimators.priors.suboptimal import Suboptimal
 from ctmhe.estimators.state import State, load_state, save_state
-from ctmhe.estimators.suboptimal import Suboptimal
 from ctmhe.estimators.trajectories import empty_path, path_at, path_rows, trajectory_at
 from ctmhe.models.continuous import Model
 from ctmhe.models.observer import known_inputs

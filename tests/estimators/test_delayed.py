@@ -22,8 +22,8 @@ from ctmhe import (
     Uniform,
     simulate,
 )
-from ctmhe.estimators.benchmark import infinite_horizon, regret
-from ctmhe.estimators.linear import rauch_tung_striebel
+from ctmhe.estimators.offline.benchmark import infinite_horizon, regret
+from ctmhe.estimators.offline.linear import rauch_tung_striebel
 from ctmhe.models.library import batch_reactor
 from ctmhe.studies.reproduce._offline import stepped
 from tests.estimators.test_offline import A, C, linear_mhe, linear_record

@@ -21,8 +21,8 @@ from ctmhe.certificates import (
     joint_weights,
 )
 from ctmhe.certificates.joint_bounds import Errors, Evidence, JointBounds
-from ctmhe.estimators.checked import CheckedPrior
-from ctmhe.estimators.joint import ExcitedPrior
+from ctmhe.estimators.priors.checked import CheckedPrior
+from ctmhe.estimators.priors.joint import ExcitedPrior
 from ctmhe.models.library import chua, chua_discrete
 
 ALPHA, N, TRUE = 2e-4, 150, 0.45

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from ctmhe import MHE, RK4, Bounds, DiscountedCost, InputError, Measurement
 from ctmhe.certificates import ExcitationMonitor, design_excitation, detect_states, joint_weights
-from ctmhe.estimators.joint import ExcitedPrior
+from ctmhe.estimators.priors.joint import ExcitedPrior
 from ctmhe.models import DiscreteModel
 from ctmhe.models.library import chua, chua_discrete
 from ctmhe.models.varying import varying_parameters

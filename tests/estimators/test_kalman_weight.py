@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ctmhe import MHE, RK4, ContinuousModel, DiscountedCost, InputError, Measurement
-from ctmhe.estimators.kalman_weight import KalmanWeight
-from ctmhe.estimators.linear import rauch_tung_striebel
+from ctmhe.estimators.offline.linear import rauch_tung_striebel
+from ctmhe.estimators.priors.kalman_weight import KalmanWeight
 from ctmhe.models.library import batch_reactor
 from ctmhe.studies.reproduce._offline import stepped
 from tests.estimators.test_offline import linear_mhe, linear_record, reactor_mhe

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ctmhe.errors import InputError
-from ctmhe.estimators.blocks import blocks_of
-from ctmhe.estimators.linear import LinearProblem, rauch_tung_striebel, solve_blocks, solve_linear
+from ctmhe.estimators.offline.blocks import blocks_of
+from ctmhe.estimators.offline.linear import LinearProblem, rauch_tung_striebel, solve_blocks, solve_linear
 from ctmhe.models.library import random_stable
 
 

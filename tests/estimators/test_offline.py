@@ -12,10 +12,10 @@ import pytest
 
 from ctmhe import MHE, RK4, Bounds, ContinuousModel, DiscountedCost, DiscreteModel, MeasurementLog
 from ctmhe.errors import InputError
-from ctmhe.estimators.benchmark import infinite_horizon, performance, rebuilt_disturbance, regret
-from ctmhe.estimators.blocks import in_parallel
-from ctmhe.estimators.linear import LinearProblem, solve_linear
-from ctmhe.estimators.offline import estimate_offline
+from ctmhe.estimators.offline.benchmark import infinite_horizon, performance, rebuilt_disturbance, regret
+from ctmhe.estimators.offline.blocks import in_parallel
+from ctmhe.estimators.offline.linear import LinearProblem, solve_linear
+from ctmhe.estimators.offline.nonlinear import estimate_offline
 from ctmhe.models.library import batch_reactor, random_stable
 from ctmhe.studies.reproduce.thesis_table_6_1 import FULL, estimator, experiment
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from ctmhe.errors import InputError
 from ctmhe.estimators import MHE, AdaptiveArrival, dual_iterations, polytopic_horizon
-from ctmhe.estimators.polytopic import renewed
+from ctmhe.estimators.priors.polytopic import renewed
 from ctmhe.models import ContinuousModel, DiscreteModel, mixture, polytope
 from ctmhe.models.library import unknown_linear
 from ctmhe.simulation import MapPlant, SingleSample, Uniform, simulate

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ctmhe import MHE, RK4, DiscountedCost, DiscreteModel, Input, InputError, Measurement
-from ctmhe.estimators.priors import Anchor
+from ctmhe.estimators.priors.base import Anchor
 from ctmhe.models.library import batch_reactor
 from ctmhe.transcription.grid import same_time
 

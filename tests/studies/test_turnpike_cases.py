@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from ctmhe.estimators.offline import estimate_offline
+from ctmhe.estimators.offline.nonlinear import estimate_offline
 from ctmhe.studies.reproduce import reproduce, thesis_6_2_1
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ctmhe.data.log import MeasurementLog
-from ctmhe.estimators.blocks import in_parallel
 from ctmhe.estimators.mhe import MHE
+from ctmhe.estimators.offline.blocks import in_parallel
 from ctmhe.types import Array, Estimate, Input, Measurement
 
 

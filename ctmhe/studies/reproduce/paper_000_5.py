@@ -9,8 +9,8 @@ import numpy as np
 
 from ctmhe.certificates.excitation_design import design_excitation
 from ctmhe.certificates.joint import JointCertificate, certify_jointly
-from ctmhe.estimators.checked import CheckedPrior
 from ctmhe.estimators.mhe import MHE
+from ctmhe.estimators.priors.checked import CheckedPrior
 from ctmhe.models.library import chua_discrete
 from ctmhe.studies.reproduce.joint_runs import over_seeds, summary, track
 from ctmhe.types import Bounds

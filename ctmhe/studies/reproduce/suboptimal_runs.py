@@ -10,9 +10,9 @@ import numpy as np
 from tqdm import tqdm
 
 from ctmhe.errors import MissingExtra
-from ctmhe.estimators.arrival import ArrivalUpdate
 from ctmhe.estimators.mhe import MHE
-from ctmhe.estimators.suboptimal import Suboptimal
+from ctmhe.estimators.priors.arrival import ArrivalUpdate
+from ctmhe.estimators.priors.suboptimal import Suboptimal
 from ctmhe.models.discrete import DiscreteModel
 from ctmhe.models.library import three_species_discrete
 from ctmhe.models.observer import observer_model

@@ -12,8 +12,8 @@ from ctmhe.certificates.excitation_design import design_excitation
 from ctmhe.certificates.joint_bounds import JointGuarantee
 from ctmhe.certificates.joint_horizons import joint_horizon
 from ctmhe.certificates.weights import detect_states, joint_weights
-from ctmhe.estimators.joint import ExcitedPrior
 from ctmhe.estimators.mhe import MHE
+from ctmhe.estimators.priors.joint import ExcitedPrior
 from ctmhe.models.continuous import box_arrays
 from ctmhe.models.library import chua_discrete
 from ctmhe.studies.reproduce.joint_runs import over_seeds, rmse, summary, track

@@ -9,8 +9,8 @@ import numpy as np
 
 from ctmhe.certificates.excitation import ExcitationMonitor
 from ctmhe.certificates.excitation_design import design_excitation
-from ctmhe.estimators.joint import ExcitedPrior
 from ctmhe.estimators.mhe import MHE
+from ctmhe.estimators.priors.joint import ExcitedPrior
 from ctmhe.models.continuous import box_arrays
 from ctmhe.models.library import chua_discrete
 from ctmhe.models.varying import varying_parameters

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from ctmhe.data.log import MeasurementLog
-from ctmhe.estimators.benchmark import infinite_horizon
 from ctmhe.estimators.mhe import MHE
-from ctmhe.estimators.offline import estimate_offline
+from ctmhe.estimators.offline.benchmark import infinite_horizon
+from ctmhe.estimators.offline.nonlinear import estimate_offline
 from ctmhe.models.discrete import DiscreteModel
 from ctmhe.types import Array, DiscountedCost
 

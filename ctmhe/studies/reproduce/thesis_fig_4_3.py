@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ctmhe.estimators.mhe import MHE
-from ctmhe.estimators.suboptimal import Suboptimal
+from ctmhe.estimators.priors.suboptimal import Suboptimal
 from ctmhe.studies.reproduce.printed_observers import REACTOR, reactor_discrete
 from ctmhe.studies.reproduce.suboptimal_runs import (
     REACTOR_RUN,

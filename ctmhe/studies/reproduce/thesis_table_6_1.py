@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ctmhe.data.log import MeasurementLog
-from ctmhe.estimators.benchmark import performance
 from ctmhe.estimators.mhe import MHE
-from ctmhe.estimators.offline import estimate_offline
+from ctmhe.estimators.offline.benchmark import performance
+from ctmhe.estimators.offline.nonlinear import estimate_offline
 from ctmhe.models.library import refill, refilled_reactor
 from ctmhe.studies.reproduce._offline import all_of, cell, squares, stepped
 from ctmhe.types import Array, DiscountedCost

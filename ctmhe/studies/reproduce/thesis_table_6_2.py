@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ctmhe.estimators.linear import LinearProblem, rauch_tung_striebel, solve_blocks, solve_linear
+from ctmhe.estimators.offline.linear import LinearProblem, rauch_tung_striebel, solve_blocks, solve_linear
 from ctmhe.models.library import random_stable
 from ctmhe.studies.reproduce._offline import all_of, cell
 from ctmhe.types import Array

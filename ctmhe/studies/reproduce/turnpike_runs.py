@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from ctmhe.data.log import MeasurementLog
-from ctmhe.estimators.benchmark import performance
-from ctmhe.estimators.kalman_weight import KalmanWeight
 from ctmhe.estimators.mhe import MHE
-from ctmhe.estimators.offline import estimate_offline
+from ctmhe.estimators.offline.benchmark import performance
+from ctmhe.estimators.offline.nonlinear import estimate_offline
+from ctmhe.estimators.priors.kalman_weight import KalmanWeight
 from ctmhe.studies.reproduce._offline import cell, squares, stepped
 from ctmhe.types import Array, Estimate
 

@@ -14,8 +14,8 @@ from ctmhe.certificates.excited_set import ExcitationDesign
 from ctmhe.certificates.joint_bounds import Errors, JointGuarantee
 from ctmhe.data.log import Log
 from ctmhe.errors import InputError
-from ctmhe.estimators.joint_evidence import joint_levels
-from ctmhe.estimators.priors import Anchor, Filtering, Memory, Told
+from ctmhe.estimators.priors.base import Anchor, Filtering, Memory, Told
+from ctmhe.estimators.priors.joint_evidence import joint_levels
 from ctmhe.models.continuous import Model
 from ctmhe.transcription.solved import Solved
 from ctmhe.types import Array, Trajectory, frozen, positive

@@ -11,7 +11,7 @@ import numpy as np
 from ctmhe.data.log import Log
 from ctmhe.errors import InputError
 from ctmhe.estimators.outlook import prior_covariance
-from ctmhe.estimators.priors import SMOOTHING, Anchor, Memory
+from ctmhe.estimators.priors.base import SMOOTHING, Anchor, Memory
 from ctmhe.estimators.trajectories import trajectory_at
 from ctmhe.transcription.solved import Solved
 from ctmhe.types import Array, positive

@@ -13,7 +13,7 @@ import numpy as np
 from ctmhe.data.log import Log
 from ctmhe.data.window import held_inputs, point_rows
 from ctmhe.errors import InputError, NotEstimated, TooLate
-from ctmhe.estimators.filter_state import Belief, Filtered, FilterState, load_filter_state, save_filter_state
+from ctmhe.estimators.filters.filter_state import Belief, Filtered, FilterState, load_filter_state, save_filter_state
 from ctmhe.estimators.mhe import Prediction
 from ctmhe.models.continuous import Model
 from ctmhe.transcription.assembly import Assembly, Records

@@ -14,10 +14,10 @@ from ctmhe.certificates.observer_function import LuenbergerObserver
 from ctmhe.data.log import Log
 from ctmhe.data.window import held_inputs
 from ctmhe.errors import InputError
-from ctmhe.estimators.decrease import connected
 from ctmhe.estimators.guesses import shifted_guess, warm_start
-from ctmhe.estimators.priors import Anchor, Memory
-from ctmhe.estimators.suboptimal_bounds import UNKNOWN, Bounded, SuboptimalBounds, additive
+from ctmhe.estimators.priors.base import Anchor, Memory
+from ctmhe.estimators.priors.decrease import connected
+from ctmhe.estimators.priors.suboptimal_bounds import UNKNOWN, Bounded, SuboptimalBounds, additive
 from ctmhe.estimators.trajectories import trajectory_at
 from ctmhe.models.continuous import Model
 from ctmhe.models.observer import gain, observer_model

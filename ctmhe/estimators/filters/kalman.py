@@ -9,8 +9,8 @@ import casadi as ca
 import numpy as np
 
 from ctmhe.errors import InputError
-from ctmhe.estimators.filter import Basis, Recursion, Sample, Slot
-from ctmhe.estimators.filter_state import Belief
+from ctmhe.estimators.filters.filter import Basis, Recursion, Sample, Slot
+from ctmhe.estimators.filters.filter_state import Belief
 from ctmhe.transcription.integrators import check_linear, is_symbolic
 from ctmhe.types import Array
 

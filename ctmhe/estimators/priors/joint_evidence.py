@@ -19,8 +19,8 @@ from ctmhe.transcription.solved import Solved
 from ctmhe.types import Array, ErrorBound, frozen
 
 if TYPE_CHECKING:
-    from ctmhe.estimators.joint import ExcitedPrior
     from ctmhe.estimators.mhe import MHE
+    from ctmhe.estimators.priors.joint import ExcitedPrior
     from ctmhe.estimators.state import State
 
 INFEASIBLE = 1e-6

@@ -18,7 +18,7 @@ from ctmhe.types import Array, ErrorBound
 
 if TYPE_CHECKING:
     from ctmhe.estimators.mhe import MHE
-    from ctmhe.estimators.suboptimal import Simulated
+    from ctmhe.estimators.priors.suboptimal import Simulated
 
 
 class Bounded(NamedTuple):

@@ -13,8 +13,8 @@ from ctmhe.certificates.joint import JointCertificate
 from ctmhe.certificates.joint_bounds import joint_level
 from ctmhe.data.log import Log
 from ctmhe.errors import InputError
-from ctmhe.estimators.joint_evidence import DATA, box_of, evidence, sizes_of
-from ctmhe.estimators.priors import Anchor, Filtering, Memory, Told
+from ctmhe.estimators.priors.base import Anchor, Filtering, Memory, Told
+from ctmhe.estimators.priors.joint_evidence import DATA, box_of, evidence, sizes_of
 from ctmhe.transcription.solved import Solved
 from ctmhe.types import Array, ErrorBound, frozen, positive
 

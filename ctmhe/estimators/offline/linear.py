@@ -11,10 +11,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from ctmhe.errors import InputError
-from ctmhe.estimators.blocks import Block, blocks_of, in_parallel
+from ctmhe.estimators.offline.blocks import Block, blocks_of, in_parallel
 from ctmhe.types import Array, frozen
 
 SETTLED = 1e-12
@@ -169,6 +168,8 @@ def solve_blocks(problem: LinearProblem, *, block: int, keep: int, workers: int 
 
 def _solve(problems: Sequence[LinearProblem]) -> list[Array]:
     """Solve problems that differ in data only: one factorisation, one column of the right-hand side for each."""
+    from scipy.linalg import cho_solve  # of SciPy only what is needed, when it is
+
     problem = problems[0]
     steps, n, invariant = problem.steps, problem.A.shape[-1], problem.invariant
     Q = problem.Q
@@ -241,6 +242,8 @@ def _right_side(problem: LinearProblem) -> Array:
 
 
 def _cholesky(matrix: Array, k: int, steps: int) -> Any:
+    from scipy.linalg import cho_factor
+
     try:
         return cho_factor(matrix)
     except np.linalg.LinAlgError:

@@ -13,9 +13,9 @@ import numpy as np
 
 from ctmhe.data.log import MeasurementLog
 from ctmhe.errors import InputError, MissingExtra
-from ctmhe.estimators.blocks import Block, blocks_of, in_parallel
 from ctmhe.estimators.guesses import shifted_guess
 from ctmhe.estimators.mhe import MHE
+from ctmhe.estimators.offline.blocks import Block, blocks_of, in_parallel
 from ctmhe.estimators.trajectories import trajectory_at
 from ctmhe.transcription.assembly import Records
 from ctmhe.transcription.problem import Guess, Window

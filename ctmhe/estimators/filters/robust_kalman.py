@@ -10,9 +10,9 @@ import casadi as ca
 import numpy as np
 
 from ctmhe.errors import InputError
-from ctmhe.estimators.filter import Basis, Recursion, Sample, Slot
-from ctmhe.estimators.filter_state import Belief
-from ctmhe.estimators.kalman import corrected, symmetric
+from ctmhe.estimators.filters.filter import Basis, Recursion, Sample, Slot
+from ctmhe.estimators.filters.filter_state import Belief
+from ctmhe.estimators.filters.kalman import corrected, symmetric
 from ctmhe.transcription.integrators import check_linear
 from ctmhe.types import Array
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ctmhe.data.log import Log
 from ctmhe.errors import InputError
-from ctmhe.estimators.priors import Anchor, Memory, Prior, prior_of
+from ctmhe.estimators.priors.base import Anchor, Memory, Prior, prior_of
 from ctmhe.estimators.trajectories import path_at
 from ctmhe.transcription.solved import Solved
 from ctmhe.types import Array

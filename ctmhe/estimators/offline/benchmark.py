@@ -11,7 +11,7 @@ import numpy as np
 from ctmhe.data.log import MeasurementLog
 from ctmhe.errors import InputError
 from ctmhe.estimators.mhe import MHE
-from ctmhe.estimators.offline import OfflineEstimate, estimate_offline, records_of
+from ctmhe.estimators.offline.nonlinear import OfflineEstimate, estimate_offline, records_of
 from ctmhe.transcription.assembly import Assembly, Records
 from ctmhe.transcription.problem import Guess, Window, cost_of
 from ctmhe.types import Array, frozen

@@ -8,7 +8,7 @@ import numpy as np
 
 from ctmhe.data.log import Log
 from ctmhe.errors import InputError
-from ctmhe.estimators.priors import Anchor, Memory
+from ctmhe.estimators.priors.base import Anchor, Memory
 from ctmhe.transcription.solved import Solved
 from ctmhe.transcription.weights import weight_matrix
 from ctmhe.types import Array
