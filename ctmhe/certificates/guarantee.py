@@ -115,6 +115,8 @@ class WindowBounds:
         Bound of U between any two states of the domain; infinite where that is unbounded.
     slack : float
         Seconds within which times are equal.
+    stated : tuple of float
+        How wrong the initial estimate is stated to be: of influence on the key alone.
     """
 
     certificate: DetectabilityCertificate
@@ -122,6 +124,7 @@ class WindowBounds:
     supply: float
     cap: float = np.inf
     slack: float = 1e-9
+    stated: tuple[float, ...] = ()
 
     @property
     def unit(self) -> float:
@@ -138,7 +141,7 @@ class WindowBounds:
         """Text that tells these bounds from others."""
         c = self.certificate
         numbers = np.concatenate([part.ravel() for part in (c.P_lower, c.P_upper, c.Q, c.R)])
-        others = np.array([c.eta, self.unit, self.horizon, self.supply, self.cap])
+        others = np.array([c.eta, self.unit, self.horizon, self.supply, self.cap, *self.stated])
         return sha256(np.concatenate([numbers, others]).tobytes()).hexdigest()[:16]
 
     def near(self, t: float) -> float:
@@ -161,6 +164,8 @@ class WindowBounds:
             return track.initial
         for end, level in zip(track.ends, track.levels, strict=True):
             if t <= end + self.near(t):
+                if level == np.inf:  # the estimate was none within the domain
+                    return level
                 fade = self.fade(max(end - t, 0.0))
                 return min(level / fade, self.cap) if fade > 0 else self.cap
         return self.cap
@@ -172,15 +177,18 @@ class WindowBounds:
         """
         near = self.near(t)
         levels = tuple(
-            self.cap if end >= since - near else level for end, level in zip(track.ends, track.levels, strict=True)
+            max(self.cap, level) if end >= since - near else level
+            for end, level in zip(track.ends, track.levels, strict=True)
         )
-        return replace(track, levels=levels, since=t, base=self.cap, wait=0.0, period=np.nan, key=self.key)
+        base = max(self.cap, *levels) if levels else self.cap
+        return replace(track, levels=levels, since=t, base=base, wait=0.0, period=np.nan, key=self.key)
 
     def before(self, track: Track, start: float) -> float:
         """Return V for a window that starts at `start`."""
         if start <= track.start + self.near(start):
             return min(track.initial, self.cap)
-        return min(self.certificate.ratio * self.at(track, start), self.cap)
+        found = self.at(track, start)
+        return found if found == np.inf else min(self.certificate.ratio * found, self.cap)
 
     def after(
         self,
@@ -190,11 +198,14 @@ class WindowBounds:
         cost: float,
         problems: Sequence[str] = (),
         given: WindowStart | None = None,
+        *,
+        astray: bool = False,
     ) -> tuple[Track, ErrorBound]:
         """Return the track and the bound after a solve at `t` of the window from `start`.
 
         `problems` say why the window is not what the theory is about; U is then bounded by the domain only. `given` is
-        what is known of its prior, if that is not the filtering prior: Theorem 3.1 then says nothing.
+        what is known of its prior, if that is not the filtering prior: Theorem 3.1 then says nothing. With problems,
+        the estimate may be `astray`: outside the domain, whose width is then no bound of its error.
         """
         ends, levels, near = track.ends, track.levels, self.near(t)
         if ends and t <= ends[-1] + near:  # a solve repeated takes its own place
@@ -207,7 +218,9 @@ class WindowBounds:
         past = replace(track, wait=max(track.wait, gap), period=period if equal else np.nan)
         before = self.before(track, start) if given is None else min(given.prior, self.cap)
         most = 2 * (self.fade(t - start) * before + self.energy(t - start))
-        level = min(most + cost * (given.factor if given else 1.0), self.cap) if not problems else self.cap
+        level = np.inf if astray else self.cap
+        if not problems:
+            level = min(most + cost * (given.factor if given else 1.0), self.cap)
         kept = [k for k, end in enumerate(ends) if end > t - self.horizon - near]
         past = replace(past, ends=(*(ends[k] for k in kept), t), levels=(*(levels[k] for k in kept), level))
         reasons = tuple(problems) or (self._unmet(past, cost, most) if given is None else given.reasons)
@@ -223,6 +236,8 @@ class WindowBounds:
                     None,
                     ("nothing bounds the error to start from: give Guarantee(error=), or a bounded domain",),
                 )
+                if np.isfinite(past.since):  # it starts anew where something does
+                    past = replace(past, since=t, base=self._worst(past), wait=0.0)
         known = not problems and np.isfinite(level)
         metric = self.certificate.P_lower
         return past, ErrorBound(level if known else None, theorem, reasons, metric, self.cap)
@@ -259,7 +274,8 @@ class WindowBounds:
         begins = (max(track.start, last - self.horizon), *track.ends[:-1])
         starts = [self.at(track, begin + 2 * self.near(begin)) for begin in begins]
         early = [track.initial] if last - track.start <= self.horizon else []
-        return min(max(*levels, *starts, *early), self.cap)
+        worst = max(*levels, *starts, *early)
+        return worst if np.inf in track.levels else min(worst, self.cap)
 
     def _theorem(self, track: Track, t: float) -> float:
         """Return the right side of (3.32).

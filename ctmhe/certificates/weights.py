@@ -90,7 +90,7 @@ def detect_states(model: Model, domain: Bounds | None = None, *, eta: float, u: 
     supply = [cp.Variable((k, k), symmetric=True) if k else None for k in (nw, o)]
     in_x, *places = np.split(np.eye(n + nw + o), [n, n + nw], axis=1)
     least = np.linalg.inv(units.x) @ basis
-    constraints: list[Any] = [P >> least.T @ least, R >> 0]
+    constraints: list[Any] = [P >> least.T @ least, R >> 0, *(weight >> 0 for weight in supply if weight is not None)]
     for A, B, E, C, D, F in zip(*inside.scaled(parts), strict=True):
         f, h = np.hstack([A, B, E]) / pace, np.hstack([C, D, F])
         matrix = h.T @ R @ h

@@ -61,6 +61,7 @@ class Guaranteed:
             supply=largest_square(certificate.Q, sizes),
             cap=largest_square(certificate.P_upper, upper - lower),
             slack=1e-9 * mhe.interval,
+            stated=() if guarantee.error is None else tuple(self.first_error(model.x.nominal).tolist()),
         )
 
     def outside(self, p: Array) -> tuple[str, ...]:
@@ -77,7 +78,7 @@ class Guaranteed:
         step, near = self.model.step, self.bounds.near(end)
         if step is not None:
             used = (times >= start - near) & (times < end - near)
-            if (missing := round((end - start) / step) - int(np.count_nonzero(used))) > 0:
+            if (missing := round((end - start) / step) - len(np.unique(np.round(times[used] / step)))) > 0:
                 return (f"{missing} steps of the window have no measurement",)
         else:
             used = (times >= _governing(times, start + near)) & (times <= end + near)
@@ -103,7 +104,7 @@ class Guaranteed:
         fresh = self.begin(t0, x0)
         if t <= t0 + self.bounds.near(t0):
             return fresh
-        return self.bounds.resumed(replace(fresh, ends=(t,), levels=(self.bounds.cap,)), t, since=t)
+        return self.bounds.resumed(replace(fresh, ends=(t,), levels=(np.inf,)), t, since=t)
 
     def first_error(self, x: Array) -> Array:
         """Return how wrong the initial estimate `x` (nx,) can be, state by state (nx,)."""
@@ -144,7 +145,13 @@ class Guaranteed:
             problems.append(f"the estimate need not be a trajectory of the model: {status.outcome.value}")
         if t > start and "prior predicted, uncertified" in status.notes:
             problems.append("prior predicted, uncertified")
-        return self.bounds.after(track, start, t, cost, problems, given)
+        astray = not solved and status.outcome not in (Outcome.SOLVED, Outcome.FALLBACK)
+        return self.bounds.after(track, start, t, cost, problems, given, astray=astray)
+
+    def within(self, x: Array) -> bool:
+        """Return whether an estimate (nx,) lies in the domain, so that its width bounds the error."""
+        lower, upper = self.domain
+        return bool((x >= lower).all() and (x <= upper).all())
 
 
 def _governing(times: Array, t: float) -> float:

@@ -21,7 +21,7 @@ from ctmhe.estimators.base import check_wait
 from ctmhe.estimators.guaranteed import Guaranteed
 from ctmhe.estimators.guesses import open_loop, resting_guess, starting_points
 from ctmhe.estimators.outlook import carried_covariance, prior_covariance
-from ctmhe.estimators.priors.base import Anchor, Filtering, Prior, Told, prior_of
+from ctmhe.estimators.priors.base import Anchor, Filtering, Memory, Prior, Told, prior_of
 from ctmhe.estimators.priors.decrease import improved
 from ctmhe.estimators.priors.suboptimal import Suboptimal
 from ctmhe.estimators.state import State, load_state, save_state
@@ -203,6 +203,7 @@ class MHE:
         self.horizon = np.inf if horizon == np.inf else positive("horizon", horizon, "seconds")
         self.prior = prior_of(prior)
         self._says: Callable[..., Told] | None = getattr(self.prior, "told", None)
+        self._revises: Callable[[Memory, float], Memory] | None = getattr(self.prior, "revised", None)
         if model.step is not None:
             if integrator is not None:
                 raise InputError("integrator: a DiscreteModel has its own step map; leave the integrator out")
@@ -360,12 +361,14 @@ class MHE:
 
     def _revised(self, state: State, t: float) -> State:
         """Return the state whose bounds do not rest on what was solved with other data at `t` and later."""
-        if self.guaranteed is None or state.track is None or t >= state.t - self.slack(t):
+        if t >= state.t - self.slack(t):
             return state
-        fields: dict[str, Any] = {"track": self.guaranteed.bounds.resumed(state.track, state.t, since=t)}
-        if self.suboptimal is not None:
-            fields["memory"] = self.suboptimal.revised(state.memory, t)
-        return made(State, state.__dict__ | fields)
+        fields: dict[str, Any] = {}
+        if self.guaranteed is not None and state.track is not None:
+            fields["track"] = self.guaranteed.bounds.resumed(state.track, state.t, since=t)
+        if self._revises is not None:
+            fields["memory"] = self._revises(state.memory, t)
+        return made(State, state.__dict__ | fields) if fields else state
 
     @staticmethod
     def _named(signals: Signals, values: Any, default: Array) -> Any:
@@ -393,7 +396,7 @@ class MHE:
         self._check_age(state, t, "measurement")
         if not complete and not np.isfinite(row).any():
             return state if self.guaranteed is None else self.doubt(state, t, f"no output has a value at t = {t:g} s")
-        self._check_step(t, "measurement")
+        t = self._at_step(t, "measurement")
         known = state.measurements.find(t)
         if known is not None:
             conflict = np.isfinite(known) & np.isfinite(row) & (known != row)
@@ -435,10 +438,15 @@ class MHE:
                 f"(now {self.horizon:g} s) accepts later arrivals"
             )
 
-    def _check_step(self, t: float, what: str) -> None:
+    def _at_step(self, t: float, what: str) -> float:
+        """Return the time of the step at which something was measured: what differs by round-off is one step."""
         step = self.model.step
-        if step is not None and abs(t - round(t / step) * step) > max(1e-6 * step, self.slack(t)):
+        if step is None:
+            return t
+        whole = round(t / step) * step
+        if abs(t - whole) > max(1e-6 * step, self.slack(t)):
             raise InputError(f"{what} at t = {t:g} s is not at a multiple of the discrete model's step {step:g} s")
+        return whole
 
     def estimate(self, state: State, t: float) -> tuple[State, Estimate]:
         """Solve the problem of the window that ends at `t`.

@@ -70,7 +70,9 @@ class Told:
 class Prior(Protocol):
     """The prior of every window: a rule, without state of its own.
 
-    One that also has a method `told(mhe, state, solved) -> Told`, asked last, has a say in what the estimate says.
+    One that also has a method `told(mhe, state, solved) -> Told`, asked last, has a say in what the estimate says. One
+    that remembers bounds has a method `revised(memory, since) -> Memory`, called when data at `since`, before the last
+    estimate, turn out to be others.
     """
 
     @property

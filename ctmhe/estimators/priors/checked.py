@@ -14,7 +14,7 @@ from ctmhe.certificates.joint_bounds import joint_level
 from ctmhe.data.log import Log
 from ctmhe.errors import InputError
 from ctmhe.estimators.priors.base import Anchor, Filtering, Memory, Told
-from ctmhe.estimators.priors.joint_evidence import DATA, box_of, evidence, sizes_of
+from ctmhe.estimators.priors.joint_evidence import DATA, box_of, digest, evidence, sizes_of
 from ctmhe.transcription.solved import Solved
 from ctmhe.types import Array, ErrorBound, frozen, positive
 
@@ -80,11 +80,30 @@ class CheckedPrior:
     def after(self, mhe: MHE, state: State, solved: Solved) -> Memory:
         """See `Prior`."""
         slack = mhe.slack(state.t)
-        log = state.memory[NAME].drop_after(state.t - slack)
+        log = self._log(mhe, state).drop_after(state.t - slack)
         M, conditions = self.joint.window(solved.trajectory, kappa=self.kappa)
         level, theorem, reasons = self._levels(mhe, state, log, solved, M)
         row = np.concatenate([[conditions.kappa, conditions.alpha, level, theorem, not reasons], M.ravel()])
-        return {NAME: log.put(state.t, row).drop_before(state.t - mhe.horizon - slack)}
+        log = log.put(state.t, row).drop_before(state.t - mhe.horizon - slack)
+        return {NAME: log, "key": Log(1).put(state.t0, np.array([_fitting(self, mhe)[3]]))}
+
+    def revised(self, memory: Memory, since: float) -> Memory:
+        """Return the memory whose bounds do not rest on what was solved with other data at `since` and later."""
+        if NAME not in memory:
+            return memory
+        times, rows = memory[NAME].arrays()
+        rows = rows.copy()
+        rows[times >= since, 2:4] = np.nan
+        return {**memory, NAME: Log.of(times, rows, rows.shape[1])}
+
+    def _log(self, mhe: MHE, state: State) -> Log:
+        """Return what is remembered; bounds that another certificate gave are not."""
+        if NAME not in state.memory:  # the state of an estimator with another prior
+            return self.begin(mhe, state)[NAME]
+        key = state.memory.get("key")
+        if key is not None and len(key) and key.arrays()[1][0, 0] != _fitting(self, mhe)[3]:
+            return self.revised(state.memory, -np.inf)[NAME]
+        return state.memory[NAME]
 
     def told(self, mhe: MHE, state: State, solved: Solved) -> Told:
         """Return the estimate as it is, with the conditions that are not met, and the bound."""
@@ -112,13 +131,17 @@ class CheckedPrior:
         self, mhe: MHE, state: State, log: Log, solved: Solved, M: Array
     ) -> tuple[float, float, tuple[str, ...]]:
         """Return level and (9) after a solve, capped by the domain, and what stands against them."""
-        unmet, sizes, initial = _fitting(self, mhe)
+        unmet, sizes, initial, _ = _fitting(self, mhe)
         joint, start = self.joint, float(solved.part("t")[0])
         widths = np.subtract(*box_of(joint.design, "xp")[::-1])
         cap = largest_square(M, widths)
         found = evidence(mhe, state, solved, 0.0) if not unmet else ""
         if isinstance(found, str):
-            return cap, cap, (*unmet, *([found] if found else []))
+            lower, upper = box_of(joint.design, "xp")
+            values = np.concatenate([state.x, state.p])
+            astray = bool(((values < lower) | (values > upper)).any())
+            most = np.inf if astray else cap
+            return most, most, (*unmet, *([found] if found else []))
         reasons, before = [], (initial(state.start),) * 2
         if not found.growing:
             earlier = log.first_from(start - mhe.slack(start))
@@ -126,7 +149,9 @@ class CheckedPrior:
                 before = (largest_square(joint.M_0, widths),) * 2
                 reasons.append("the window does not start at a solve, as (7) has it: estimate at every step")
             else:
-                before = earlier[1][0] * earlier[1][2], earlier[1][0] * earlier[1][3]
+                kept = earlier[1][2:4]
+                widest = largest_square(joint.M_0, widths)
+                before = tuple(np.where(np.isnan(kept), widest, earlier[1][0] * kept).tolist())
         level = joint_level(joint, before[0], found, sizes)[0]
         _, theorem, cost = joint_level(joint, before[1], found, sizes)
         if not reasons and cost > theorem / 2 * (1 + 1e-6) + 1e-12:
@@ -142,8 +167,8 @@ NONE = "no bound: "
 
 
 @lru_cache(maxsize=8)
-def _fitting(prior: CheckedPrior, mhe: MHE) -> tuple[tuple[str, ...], Array, Any]:
-    """Return what stands against bounds, the largest |w|, and a function of the initial estimate: |e(0)|^2_M_0 at most.
+def _fitting(prior: CheckedPrior, mhe: MHE) -> tuple[tuple[str, ...], Array, Any, float]:
+    """Return what stands against bounds, the largest |w|, |e(0)|^2_M_0 at most as a function of the guess, and a key.
 
     Raises `InputError` where the estimator's signals are others, or its parameters are known.
     """
@@ -186,4 +211,12 @@ def _fitting(prior: CheckedPrior, mhe: MHE) -> tuple[tuple[str, ...], Array, Any
             error[names.index(name)] = abs(float(size))
         return largest_square(joint.M_0, error)
 
-    return tuple(unmet), sizes, initial
+    told = [
+        joint.M_0,
+        joint.Q,
+        joint.R,
+        sizes,
+        np.array([joint.eta, initial(np.concatenate([model.x.nominal, model.p.nominal]))]),
+        *widths,
+    ]
+    return tuple(unmet), sizes, initial, digest(told)

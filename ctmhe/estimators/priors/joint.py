@@ -120,7 +120,7 @@ class ExcitedPrior:
         anchor = FILTERING.at(mhe, state, start, growing)
         if growing or anchor is None:
             return anchor  # with nothing known there, the prior is predicted from what the last estimate told
-        found = self._row(state.memory[NAME], start - mhe.slack(start))
+        found = self._row(self._log(mhe, state), start - mhe.slack(start))
         if found is None or found.whole:
             return anchor
         value = anchor.value.copy()
@@ -130,7 +130,7 @@ class ExcitedPrior:
     def after(self, mhe: MHE, state: State, solved: Solved) -> Memory:
         """See `Prior`."""
         place, slack = places(self.monitor.design, mhe), mhe.slack(state.t)
-        log, start = state.memory[NAME].drop_after(state.t - slack), float(solved.part("t")[0])
+        log, start = self._log(mhe, state).drop_after(state.t - slack), float(solved.part("t")[0])
         before = self._row(log, log.last_time)
         trajectory = solved.trajectory
         found = place.end(trajectory)
@@ -153,7 +153,24 @@ class ExcitedPrior:
         if self.guarantee is not None:
             bounds, reasons = self._levels(mhe, state, log, solved, level)
             row = row._replace(bounds=np.append(bounds, float(not reasons)))
-        return {NAME: log.put(state.t, row.array).drop_before(state.t - mhe.horizon - slack)}
+        log = log.put(state.t, row.array).drop_before(state.t - mhe.horizon - slack)
+        return {NAME: log, "key": Log(1).put(state.t0, np.array([self._key(mhe)]))}
+
+    def revised(self, memory: Memory, since: float) -> Memory:
+        """Return the memory whose bounds do not rest on what was solved with other data at `since` and later."""
+        return {**memory, NAME: forgotten(memory[NAME], since, 7)} if NAME in memory else memory
+
+    def _key(self, mhe: MHE) -> float:
+        return 0.0 if self.guarantee is None else joint_levels(self, mhe).key
+
+    def _log(self, mhe: MHE, state: State) -> Log:
+        """Return what is remembered; bounds that another guarantee gave are not."""
+        log, key = state.memory.get(NAME), state.memory.get("key")
+        if log is None:  # the state of an estimator with another prior
+            return self.begin(mhe, state)[NAME]
+        if key is not None and len(key) and key.arrays()[1][0, 0] != self._key(mhe):
+            return forgotten(log, -np.inf, 7)
+        return log
 
     def told(self, mhe: MHE, state: State, solved: Solved) -> Told:
         """Return what the estimate says in place of the window's own end: its parameters, a bound, notes."""
@@ -190,8 +207,9 @@ class ExcitedPrior:
         if not growing:
             found = log.first_from(start - mhe.slack(start))
             if found is not None and found[0] <= start + mhe.slack(start):
-                row = Row.of(found[1], self._count).bounds[:-1]
-        told = None if last is None else (float(last.bounds[2]), float(last.bounds[5]))
+                row = levels.known(Row.of(found[1], self._count).bounds[:-1])
+        known_last = None if last is None else levels.known(last.bounds[:-1])
+        told = None if known_last is None else (float(known_last[2]), float(known_last[5]))
         initial = levels.initial(state.start) if growing or told is None else None
         if told is None:
             told = (initial.told, initial.told) if initial is not None else (levels.cap_p, levels.cap_p)
@@ -200,7 +218,7 @@ class ExcitedPrior:
         elif row is not None:
             before = (Errors(row[0], row[1], row[2]), Errors(row[3], row[4], row[5]))
         else:  # between solves: of states only the domain is known
-            prior = max(*told, *([] if last is None else [last.bounds[1], last.bounds[4]]))
+            prior = max(*told, *([] if known_last is None else [known_last[1], known_last[4]]))
             known = Errors(levels.cap_x, prior, prior)
             before = (known, known)
         return levels.after(mhe, state, solved, before, told, level, aligned=growing or row is not None)
@@ -223,6 +241,14 @@ class ExcitedPrior:
         """Return the projection (k, k) on the excited combinations, None where there is none."""
         basis, nominal = information.excited(self.alpha), information.nominal
         return nominal[:, None] * (basis @ basis.T) / nominal if basis.shape[1] else None
+
+
+def forgotten(log: Log, since: float, width: int) -> Log:
+    """Return a log whose last `width` columns are unknown from `since` on."""
+    times, rows = log.arrays()
+    rows = rows.copy()
+    rows[times >= since, -width:] = np.nan
+    return Log.of(times, rows, rows.shape[1])
 
 
 def marginal(information: Information) -> Array:

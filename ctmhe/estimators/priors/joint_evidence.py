@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from hashlib import sha256
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -56,6 +57,21 @@ class JointLevels:
         return self.bounds.cap_p
 
     @cached_property
+    def key(self) -> float:
+        """A number that tells these bounds from others."""
+        states, excited, weights = self.bounds.states, self.guarantee.excited, self.guarantee.weights
+        parts = [states.P_lower, states.P_upper, states.S, states.Q, states.R, excited.S, excited.P, excited.Q,
+                 excited.R, weights.W, weights.V, weights.Q, weights.R, self.bounds.sizes]  # fmt: skip
+        model = self.design.model
+        first = self.initial(np.concatenate([model.x.nominal, model.p.nominal]))
+        numbers = [states.eta, excited.eta, self.bounds.alpha, self.bounds.horizon, first.state, first.prior]
+        return digest([*parts, np.array(numbers, dtype=float)])
+
+    def known(self, errors: Array) -> Array:
+        """Return `Errors` of level and theorem (6,), those that are unknown by what the domain makes of them."""
+        return np.where(np.isnan(errors), [self.cap_x, self.cap_p, self.cap_p] * 2, errors)
+
+    @cached_property
     def metric(self) -> Array:
         """P_lower and S, of states and parameters (nx + np, nx + np)."""
         return frozen(block_diag(self.bounds.states.P_lower, self.guarantee.excited.S))
@@ -92,8 +108,11 @@ class JointLevels:
             reasons = (*reasons, found)
         if reasons:
             excited, full = level >= self.bounds.alpha, solved.n >= self.bounds.horizon
+            lower, upper = box_of(self.design, "x")
+            astray = len(state.x) == len(lower) and bool(((state.x < lower) | (state.x > upper)).any())
+            state_cap = np.inf if astray else self.cap_x
             ends = [
-                Errors(self.cap_x, self.cap_p if excited and full else one.prior, self.cap_p if excited else last)
+                Errors(state_cap, self.cap_p if excited and full else one.prior, self.cap_p if excited else last)
                 for one, last in zip(before, told, strict=True)
             ]
         else:
@@ -138,11 +157,12 @@ def evidence(mhe: MHE, state: State, solved: Solved, level: float) -> Evidence |
     used = solved.part("t")[:-1][np.diff(solved.part("t")) > 0]
     times, rows = state.measurements.arrays(state.t - near)
     inside = times >= start - near
-    rows = rows[inside]
+    times, rows = times[inside], rows[inside]
     doubts = [reason for when, reason in state.doubts if when >= start - near]
     if doubts:
         return f"{DATA}{doubts[-1]}"
-    if len(rows) != len(used) or not np.isfinite(rows).all():
+    placed = len(rows) == len(used) and bool((np.abs(times - used) <= 1e-6 * mhe.interval).all())
+    if not placed or not np.isfinite(rows).all():
         return f"{DATA}{len(used) - int(np.isfinite(rows).all(axis=1).sum())} steps have no complete measurement"
     if start > state.t0 + near and start > state.t - mhe.horizon + near:
         return f"{DATA}it does not reach back over the horizon"
@@ -160,6 +180,12 @@ def evidence(mhe: MHE, state: State, solved: Solved, level: float) -> Evidence |
     prior = solved.part("prior")
     growing = start <= state.t0 + near
     return Evidence(x[0] - prior[:nx], p - prior[nx:], w, trajectory.y[:n] - rows, growing, level)
+
+
+def digest(parts: list[Array]) -> float:
+    """Return a number that stands for arrays."""
+    content = sha256(np.concatenate([np.ravel(np.asarray(part, dtype=float)) for part in parts]).tobytes()).digest()
+    return float(int.from_bytes(content[:6], "big"))
 
 
 def box_of(design: ExcitationDesign, keys: str) -> tuple[Array, Array]:

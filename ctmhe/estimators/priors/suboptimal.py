@@ -164,11 +164,14 @@ class Suboptimal:
         row = log.find(state.t)
         if row is None or state.t == state.t0:
             return state.memory
-        row[-2:] = self.bound(mhe).bounds.of(bound)
+        assert mhe.guaranteed is not None
+        row[-2:] = self.bound(mhe).bounds.of(bound, within=mhe.guaranteed.within(state.x))
         return {**state.memory, "observer": log.put(state.t, row)}
 
     def revised(self, memory: Memory, since: float) -> Memory:
         """Return the memory whose bounds do not rest on what was solved with other data at `since` and later."""
+        if "observer" not in memory:  # the state of an estimator with another prior
+            return memory
         times, rows = memory["observer"].arrays()
         rows = rows.copy()
         rows[times >= since, -2:] = np.inf
@@ -332,7 +335,11 @@ class Bound:
     def lacking(self, mhe: MHE, state: State, start: float, end: float) -> tuple[str, ...]:
         """Return what is missing, or doubtful, of the data that the observer was fed with on [start, end]."""
         slack = mhe.slack(end)
-        if self.bounds.unmet or mhe.guaranteed is None or end <= start + slack:
+        if self.bounds.unmet or mhe.guaranteed is None:
+            return ()
+        if reasons := self.bounds.elsewhere(state.p):
+            return reasons
+        if end <= start + slack:
             return ()
         times, rows = state.measurements.arrays(end + slack)
         doubts = mhe.guaranteed.current(state.doubts, times, start)

@@ -73,12 +73,15 @@ class SuboptimalBounds:
         self.to_observer = largest_ratio(V.P_upper, U.P_lower)
         self.unit = model.step or 1.0
         self.lower, self.upper = box_arrays(model.x, self.observer.domain.x, "the observer's domain")
+        self.widest = largest_square(V.P_upper, self.upper - self.lower)
         self.x_names = model.x.names
         self.process = [model.w.index(name) for name in self.observer.process]
         self.discount, self.filtering = float(mhe.cost.eta or 1.0), mhe.assembly.filtering
         self.cap = mhe.guaranteed.bounds.cap
         self.without_theorem = self._theorem_unmet(mhe)
+        first = mhe.guaranteed.bounds
         told = (V.P_upper, V.Q, V.R, U.P_lower, U.P_upper, U.Q, np.array([V.eta, U.eta, self.supply]), watching.K)
+        told = (*told, np.array([first.supply, *first.stated]), self.lower, self.upper)
         digest = sha256(np.concatenate([np.ravel(part) for part in told]).tobytes()).digest()
         self.key = float(int.from_bytes(digest[:6], "big"))
 
@@ -90,6 +93,8 @@ class SuboptimalBounds:
             return tuple(found)
         if (observer.model.step or 0.0) != (model.step or 0.0):
             found.append("the auxiliary observer lives in another time than the model")
+        if not _same(observer.model, model):
+            found.append(f"the auxiliary observer is one of {observer.model.name!r}, whose functions are others")
         if observer.margin < 0:
             found.append(f"the auxiliary observer's V_o fails by {-observer.margin:.2g}: no certificate")
         assert mhe.guaranteed is not None
@@ -164,7 +169,13 @@ class SuboptimalBounds:
 
     def passed(self, bounded: Bounded, seconds: float, x: Array, lacking: tuple[str, ...]) -> Bounded:
         """Return bounds of V_o after a way x (m, nx) of the observer, none where it or its data were not as assumed."""
-        return UNKNOWN if self.unmet or lacking or self.outside(x) else self.carried(bounded, seconds)
+        if self.unmet or lacking or self.outside(x):
+            return UNKNOWN
+        return self.carried(self.capped(bounded), seconds)
+
+    def capped(self, bounded: Bounded) -> Bounded:
+        """Return bounds of V_o for an observer that is in its domain, as the truth is."""
+        return Bounded(*(min(value, self.widest) for value in bounded))
 
     def carried(self, bounded: Bounded, seconds: float) -> Bounded:
         """Return bounds of V_o after so many seconds: (4.20), with the largest disturbances."""
@@ -175,13 +186,23 @@ class SuboptimalBounds:
         added = self.supply * (1 - eta**steps) / rate
         return Bounded(*(eta**steps * value + added for value in bounded))
 
-    def of(self, bound: ErrorBound | None) -> Bounded:
-        """Return bounds of V_o between an estimate and the truth, from those of U (4.43)."""
+    def elsewhere(self, p: Array) -> tuple[str, ...]:
+        """Return which known parameters (np,) the observer's certificate is not about."""
+        assert self.observer is not None
+        model = self.observer.model
+        lower, upper = box_arrays(model.p, self.observer.domain.p, "the observer's domain of p")
+        out = [name for name, value, a, b in zip(model.p.names, p, lower, upper, strict=True) if not a <= value <= b]
+        return (f"parameter {', '.join(out)} lies outside the observer's domain",) if out else ()
+
+    def of(self, bound: ErrorBound | None, *, within: bool) -> Bounded:
+        """Return bounds of V_o between an estimate and the truth, from those of U (4.43).
+
+        The domain caps them for an estimate that lies `within` it.
+        """
         if self.unmet or bound is None:
             return UNKNOWN
         level, theorem = (np.inf if part is None else self.to_observer * part for part in (bound.level, bound.theorem))
-        cap = self.to_observer * self.cap
-        return Bounded(min(level, cap), theorem)
+        return Bounded(min(level, self.to_observer * self.cap) if within else level, theorem)
 
     def window(
         self, observer: Simulated, times: Array, error: Array, lacking: tuple[str, ...], kept: bool
@@ -207,23 +228,25 @@ class SuboptimalBounds:
         if out := self.outside(every):
             reasons.append(f"the auxiliary observer leaves its domain: {', '.join(out)}")
         start, end = float(times[0]), float(times[-1])
-        V = self.carried(observer.bounded, start - observer.since) if not reasons else UNKNOWN
+        own = self.capped(observer.bounded)
+        V = self.carried(own, start - observer.since) if not reasons else UNKNOWN
         first = np.sqrt(max(error[0] @ self.system.P_upper @ error[0], 0.0))
         prior = (np.sqrt(self.to_system * V.found) + first) ** 2
         reasons = reasons or list(self.without_theorem)
         if not kept:
             reasons.append("the candidate leaves the bounds")
-        theorem = None if reasons else self._theorem(observer, end - start, end - observer.since, error)
+        theorem = None if reasons else self._theorem(own, end - start, end - observer.since, error)
         if theorem is not None and not np.isfinite(theorem):
             theorem, reasons = None, ["nothing bounds the error to start from: give Guarantee(error=)"]
-        return WindowStart(float(prior), theorem, tuple(reasons))
+        factor = 1 / self.discount if self.filtering else 1.0  # the newest output counts fully there
+        return WindowStart(float(prior), theorem, tuple(reasons), factor)
 
-    def _theorem(self, observer: Simulated, window: float, run: float, error: Array) -> float:
+    def _theorem(self, first: Bounded, window: float, run: float, error: Array) -> float:
         """Return the right side of (4.35), or (4.62) where the observer was projected."""
         steps, U, V = round(window / self.unit), self.system, self.function
         projected = bool(error.any())
         sigma = self._sigma(steps, projected)
-        end = self.carried(observer.bounded, run).theorem
+        end = self.carried(first, run).theorem
         found = (2 + sigma) * end * (2 if projected else 1) + 2 * self.energy(window)
         if not projected:
             return found
@@ -236,7 +259,7 @@ class SuboptimalBounds:
         largest = float(np.linalg.eigvalsh(Q_s)[-1])
         weight = 2 * sigma + 4 * largest * (self.lipschitz.f + self.kappa * self.lipschitz.h) ** 2
         weight *= max(1.0, (self.discount / V.eta) ** steps)
-        return found + weight * float(np.sum(self.discount ** np.arange(steps) * squares[steps - 1 :: -1]))
+        return found + weight * float(np.sum(self.discount ** np.arange(steps) * squares[:steps][::-1]))
 
 
 def additive(model: Model, process: list[int]) -> bool:
@@ -249,6 +272,20 @@ def additive(model: Model, process: list[int]) -> bool:
         moved, plain = (np.asarray(model.dynamics(0.0, x, u, v, model.p_start)).ravel() for v in (w, still))
         if len(process) != len(model.x) or not np.allclose(moved - plain, w[process], rtol=1e-9, atol=1e-12):
             return False
+    return True
+
+
+def _same(one: Model, other: Model) -> bool:
+    """Return whether two models with the same signals have the same functions, as far as three points tell."""
+    if any(getattr(one, key).names != getattr(other, key).names for key in "xuwpy"):
+        return False
+    rng = np.random.default_rng(4)
+    for _ in range(3):
+        x, u, w = (rng.uniform(0.1, 1, len(part)) * part.nominal for part in (one.x, one.u, one.w))
+        for name in ("dynamics", "output"):
+            values = [np.asarray(getattr(model, name)(0.0, x, u, w, one.p_start)).ravel() for model in (one, other)]
+            if not np.allclose(*values, rtol=1e-9, atol=1e-12, equal_nan=True):
+                return False
     return True
 
 
