@@ -256,7 +256,9 @@ def _chosen(a: Array, b: Array, c: Array, d: Array) -> Pair:
 
 def _rest(a: Array, b: Array, c: Array, d: Array) -> Pair:
     size = np.minimum(np.maximum(np.abs(c), np.abs(d)), np.maximum(np.abs(a), np.abs(b)))
-    return np.where(a >= 0, 0.0, -size), np.where(b <= 0, 0.0, size)
+    undefined = (c <= 0) & (d >= 0)  # no number for a divisor of zero
+    low, high = np.where(a >= 0, 0.0, -size), np.where(b <= 0, 0.0, size)
+    return np.where(undefined, -np.inf, low), np.where(undefined, np.inf, high)
 
 
 def _signed(a: Array, b: Array, c: Array, d: Array) -> Pair:

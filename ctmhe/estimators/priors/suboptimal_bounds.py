@@ -174,8 +174,8 @@ class SuboptimalBounds:
         return self.carried(self.capped(bounded), seconds)
 
     def capped(self, bounded: Bounded) -> Bounded:
-        """Return bounds of V_o for an observer that is in its domain, as the truth is."""
-        return Bounded(*(min(value, self.widest) for value in bounded))
+        """Return bounds of V_o for an observer that is in its domain, as the truth is; the theorem's as it was."""
+        return Bounded(min(bounded.found, self.widest), bounded.theorem)
 
     def carried(self, bounded: Bounded, seconds: float) -> Bounded:
         """Return bounds of V_o after so many seconds: (4.20), with the largest disturbances."""
@@ -237,7 +237,8 @@ class SuboptimalBounds:
             reasons.append("the candidate leaves the bounds")
         theorem = None if reasons else self._theorem(own, end - start, end - observer.since, error)
         if theorem is not None and not np.isfinite(theorem):
-            theorem, reasons = None, ["nothing bounds the error to start from: give Guarantee(error=)"]
+            theorem = None
+            reasons = ["by theorem nothing bounds the error that the observer started from: give Guarantee(error=)"]
         factor = 1 / self.discount if self.filtering else 1.0  # the newest output counts fully there
         return WindowStart(float(prior), theorem, tuple(reasons), factor)
 
